@@ -1,0 +1,329 @@
+"""The commands, nothing else: what they import, they import when they run."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from petfsi import __version__
+from petfsi.errors import PetfsiError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+INTERRUPTED = 130
+#: Seconds that ranks have to fail together before one that failed alone ends the others.
+AGREE_SECONDS = 10.0
+#: What the machine, not petfsi, refuses.
+MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EMFILE, errno.EIO)
+
+_OPTION = re.compile(r"--?[A-Za-z]")
+
+
+class SolverCommand(click.Command):
+    """A command whose words with one dash belong to PETSc, each with the value behind it."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take PETSc's options out, then parse the rest as click does."""
+        own, petsc = self._split(ctx, args)
+        ctx.meta["petsc"] = petsc
+        try:
+            return super().parse_args(ctx, own)
+        except click.MissingParameter as error:
+            if not petsc:
+                raise
+            hint = "Give it before the PETSc options: a word that follows one of them is its value."
+            raise click.UsageError(f"{error.format_message()} {hint}", ctx) from None
+
+    def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
+        """Put the arguments first, as they must stand before PETSc's options."""
+        arguments = [p.make_metavar(ctx) for p in self.get_params(ctx) if isinstance(p, click.Argument)]
+        return [*arguments, "[OPTIONS]", "[PETSc options]..."]
+
+    def _split(self, ctx: click.Context, args: list[str]) -> tuple[list[str], list[str]]:
+        flags = {name: getattr(p, "is_flag", False) for p in self.get_params(ctx) for name in p.opts}
+        own: list[str] = []
+        petsc: list[str] = []
+        words = list(reversed(args))
+        while words:
+            word = words.pop()
+            if word == "-h":
+                own.append("--help")
+            elif f"-{word}" in flags and not word.startswith("--"):
+                raise click.UsageError(f"'{word}': petfsi's own options have two dashes: -{word}", ctx)
+            elif re.match(r"-[A-Za-z]", word):
+                petsc.append(word)
+                if words and not _OPTION.match(words[-1]):
+                    petsc.append(words.pop())
+            else:
+                own.append(word)
+                if flags.get(word) is False and words:
+                    own.append(words.pop())
+        return own, petsc
+
+
+_set = click.option("--set", "sets", multiple=True, metavar="KEY=VALUE", help="Override a setting, e.g. time.dt=0.01.")
+_steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps.")
+_wall = click.option(
+    "--wall-limit",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Checkpoint and stop, resumable, before this much time has passed.",
+)
+
+
+@click.group(context_settings={"max_content_width": 100})
+@click.version_option(__version__, prog_name="petfsi", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Advance fluids and deformable solids together, solved with PETSc.
+
+    Works alone and under mpirun. Exit codes: 0 done; 2 the scene or the options are wrong; 3 the solve failed or
+    the state blew up; 75 stopped early and resumable.
+    """
+
+
+@cli.command(cls=SolverCommand)
+@click.argument("scene", type=click.Path(path_type=Path))
+@_set
+@click.option("--out", type=click.Path(path_type=Path), help="Run directory; runs/<scene> by default.")
+@_steps
+@click.option("--overwrite", is_flag=True, help="Replace the run that stands in the run directory.")
+@_wall
+@click.pass_context
+def run(
+    ctx: click.Context,
+    scene: Path,
+    sets: tuple[str, ...],
+    out: Path | None,
+    steps: int | None,
+    overwrite: bool,
+    wall_limit: float | None,
+) -> NoReturn:
+    """Run SCENE, a TOML file, into a new run directory."""
+    petsc = ctx.meta["petsc"]
+
+    def work(comm: MPI.Comm) -> int:
+        from petfsi.geometry.meshes import from_root
+        from petfsi.scene.load import load_scene
+
+        loaded = from_root(comm, lambda: load_scene(scene, sets))
+        _start_petsc(petsc)
+        from petfsi.run import run_scene
+
+        return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite)
+
+    ctx.exit(_together(work))
+
+
+@cli.command(cls=SolverCommand)
+@click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
+@_set
+@_steps
+@_wall
+@click.pass_context
+def resume(
+    ctx: click.Context, directory: Path, sets: tuple[str, ...], steps: int | None, wall_limit: float | None
+) -> NoReturn:
+    """Go on with the run in DIR from its last good checkpoint.
+
+    --set may change time.end, [output] and [checkpoint] only.
+    """
+    petsc = ctx.meta["petsc"]
+
+    def work(_comm: MPI.Comm) -> int:
+        _start_petsc(petsc)
+        from petfsi.run import resume_run
+
+        return resume_run(directory, steps, petsc, wall_limit, list(sets))
+
+    ctx.exit(_together(work))
+
+
+@cli.command(cls=SolverCommand)
+@click.argument("scene", type=click.Path(path_type=Path))
+@_set
+@click.pass_context
+def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
+    """Print what SCENE would solve, or every mistake in it, without running."""
+
+    def work() -> int:
+        from petfsi.plan import describe_plan
+        from petfsi.scene.load import load_scene
+
+        _say(describe_plan(load_scene(scene, sets), ctx.meta["petsc"]))
+        return 0
+
+    ctx.exit(_alone(work))
+
+
+@cli.command()
+@click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--every", type=click.IntRange(min=1), default=1, help="Draw every K-th output only.", metavar="K")
+@click.pass_context
+def plot(ctx: click.Context, directory: Path, every: int) -> NoReturn:
+    """Draw pictures of the run in DIR."""
+
+    def work() -> int:
+        from petfsi.output.pictures import plot_run
+
+        for picture in plot_run(directory, every):
+            _say(str(picture))
+        return 0
+
+    ctx.exit(_alone(work))
+
+
+@cli.command()
+@click.pass_context
+def info(ctx: click.Context) -> NoReturn:
+    """Print versions, what PETSc was built with, solver prefixes and the shipped options files."""
+
+    def work() -> int:
+        _start_petsc([])
+        from petfsi.plan import describe_info
+
+        _say(describe_info())
+        return 0
+
+    ctx.exit(_alone(work))
+
+
+def _start_petsc(options: Sequence[str]) -> None:
+    """Start PETSc with the options that count at its start; files are read later, by those who know where to look."""
+    import petsc4py
+
+    words, given = iter(options), []
+    for word in words:
+        if word == "-options_file":
+            next(words, None)
+        else:
+            given.append(word)
+    petsc4py.init(["petfsi", *given])
+
+
+# ---- how commands end ---------------------------------------------------------------------------------------
+
+
+def _launched_rank() -> int:
+    """Return this process's rank as the launcher says, without starting MPI; 0 where there is none."""
+    names = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "MV2_COMM_WORLD_RANK")
+    return next((int(os.environ[name]) for name in names if os.environ.get(name, "").isdigit()), 0)
+
+
+def _say(text: str) -> None:
+    if _launched_rank() == 0:
+        click.echo(text)
+
+
+def _complain(text: str) -> None:
+    click.echo(f"petfsi: {text}", err=True)
+
+
+def _alone(work: Callable[[], int]) -> int:
+    """Return the exit code of work that every rank does by itself; rank 0 alone speaks."""
+    try:
+        return work()
+    except BrokenPipeError:
+        raise  # click's: the reader of our output has left
+    except (Exception, KeyboardInterrupt) as error:
+        code, text = _verdict(error)
+        if _launched_rank() == 0:
+            _complain(text)
+        return code
+
+
+def _together(work: Callable[[Any], int]) -> int:
+    """Return the exit code of collective work.
+
+    Ranks that fail together end together, and rank 0 says why. A rank that fails alone ends the others, who wait
+    for it in some collective call, once they have had ``AGREE_SECONDS`` to join.
+    """
+    try:
+        from mpi4py import MPI
+    except Exception as error:
+        code, text = _verdict(error)
+        _complain(text)
+        return code
+    comm = MPI.COMM_WORLD
+    apart = comm.Dup()  # a meeting here cannot be mistaken for one of the computation's own collectives
+    try:
+        return work(comm)
+    except (Exception, KeyboardInterrupt) as error:
+        code, text = _verdict(error)
+    if not _all_arrive(apart):
+        _complain(f"rank {comm.rank} of {comm.size} failed alone: {text}")
+        comm.Abort(code)
+    verdicts = apart.allgather((code, text))
+    if comm.rank == 0:
+        for said in dict.fromkeys(said for _, said in verdicts):
+            _complain(said)
+    return verdicts[0][0]
+
+
+def _all_arrive(comm: MPI.Comm) -> bool:
+    """Return whether every rank comes here in time."""
+    request = comm.Ibarrier()
+    limit = time.monotonic() + AGREE_SECONDS
+    while not request.Test():
+        if time.monotonic() > limit:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def _verdict(error: BaseException) -> tuple[int, str]:
+    """Return the exit code and the words for an exception."""
+    if os.environ.get("PETFSI_TRACEBACK") == "1":
+        story = "".join(traceback.format_exception(error)).rstrip()
+        return _verdict_in_short(error)[0], story
+    return _verdict_in_short(error)
+
+
+def _verdict_in_short(error: BaseException) -> tuple[int, str]:
+    if isinstance(error, PetfsiError):
+        return error.exit_code, str(error)
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, "interrupted"
+    if isinstance(error, MemoryError):
+        return 1, "the machine's memory is used up; 'petfsi check' estimates what a scene needs"
+    if isinstance(error, OSError) and error.errno in MACHINE:
+        return 1, f"{error.filename or 'a file'}: {error.strerror}"
+    what = " ".join(str(error).split())[:300]
+    return 1, (
+        f"{type(error).__name__}: {what} (at {_place(error)}); this is a defect in petfsi; "
+        "set PETFSI_TRACEBACK=1 and run again to see where it comes from"
+    )
+
+
+def _place(error: BaseException) -> str:
+    """Return the innermost line of petfsi that an exception passed."""
+    package = str(Path(__file__).parent)
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(package)]
+    if not frames:
+        return "an unknown place"
+    return f"petfsi/{Path(frames[-1].filename).relative_to(package)}:{frames[-1].lineno}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return its exit code."""
+    try:
+        return cli.main(args=arguments, prog_name="petfsi", standalone_mode=False) or 0
+    except click.ClickException as error:
+        if _launched_rank() == 0:
+            error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,42 @@
+"""What every coupling offers: the blocks between two fields, and what each step does with them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from petsc4py import PETSc
+
+
+class Coupling(ABC):
+    """Joins two fields; neither of them knows of it.
+
+    Attributes
+    ----------
+    blocks : dict
+        Off-diagonal blocks by (name of the row's field, name of the column's field), AIJ, SI units; the same
+        matrix objects for the whole run.
+    pattern_version : int
+        Grows whenever the pattern of a block changes; the same on all ranks.
+    n_coupled, n_assembled : int
+        How often the transfer operators were made and the blocks filled; a step that changes nothing adds nothing.
+    """
+
+    blocks: dict[tuple[str, str], PETSc.Mat]
+    pattern_version: int = 0
+    n_coupled: int = 0
+    n_assembled: int = 0
+
+    @abstractmethod
+    def couple(self, time: float, dt: float) -> None:
+        """Refresh the transfer operators for the present geometry. Collective."""
+
+    @abstractmethod
+    def assemble(self, time: float, dt: float) -> None:
+        """Fill the blocks (only if they changed) and add what is known to the fields' ``rhs``. Collective.
+
+        To be called after the fields have assembled the step from ``time`` to ``time + dt``.
+        """
+
+    @abstractmethod
+    def accept(self, time: float, dt: float) -> None:
+        """Hand over what the second field needs of the first, after the first one has accepted. Collective."""

@@ -1,0 +1,259 @@
+"""The paper's transfer between a regular grid and a surface: rays between cell centres, pressure by quadrature."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_matrix
+
+from petfsi.couplings.base import Coupling
+from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
+from petfsi.fields.mac.kinds import FLUID, SOLID, SOLID_FACE, VOID
+from petfsi.geometry import rays
+from petfsi.geometry.surfaces import Surface
+from petfsi.petsc import IntType, Layout, gather_triplets, new_block, set_csr
+from petfsi.scene import schema
+
+if TYPE_CHECKING:
+    from petfsi.fields.mac.fluid import MacFluid
+
+
+#: This rank's rows of a matrix: indptr, global columns, values.
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class HasSurface(Protocol):
+    """What the coupling asks of a solid; all arrays are the same on every rank."""
+
+    name: str
+    layout: Layout
+
+    def surface(self) -> Surface:
+        """Return the wet surface; it never changes."""
+
+    def surface_positions(self) -> np.ndarray:
+        """Return the present positions of its points, (n_points, dim)."""
+
+    def surface_velocity(self) -> np.ndarray:
+        """Return the present velocities of its points, (n_points, dim)."""
+
+    def fixed_velocity(self) -> np.ndarray:
+        """Return the prescribed unknowns at the new time, (n_unknowns,), anything elsewhere."""
+
+
+class RayCoupling(Coupling):
+    """Couples a MAC fluid and a solid's surface as in the paper.
+
+    A face whose two cell centres are cut apart by a facet lets through what the solid does where their segment meets
+    the facet (H, from the facet's shape functions); with D1 the net outflow of cells through such faces, the rows of
+    the fluid cells get D1 H u. The pressure on a facet is interpolated among the fluid cells in front of it, and
+
+        (J p)_i = - ∫ N_i n p dA ,   n outward,
+
+    is its force on the solid's nodes. The two are not transposes of each other.
+
+    Attributes
+    ----------
+    touched : ndarray of bool
+        Cell array: fluid cells whose row of D1 H is not zero (valid in ghosts).
+
+    References
+    ----------
+    N. Chentanez et al., Simultaneous coupling of fluids and deformable bodies, SCA 2006, section 3.4.
+    """
+
+    def __init__(self, fluid: MacFluid, solid: HasSurface, spec: schema.Coupling) -> None:
+        self.fluid, self.solid, self.quadrature = fluid, solid, spec.quadrature
+        self.grid = fluid.grid
+        self.comm: MPI.Comm = self.grid.comm
+        self.dim = self.grid.dim
+        self.box = Box.of(self.grid)
+        self.surface = solid.surface()
+        self.wet = np.flatnonzero(~self.surface.void)
+        # the surface's own unknowns alone, so that no product runs over all of the solid's
+        self._free = np.unique(self.surface.point_map.indices)
+        self._free_map = self.surface.point_map[:, self._free]
+        self.flux_block = new_block(self.comm, fluid.layout, solid.layout)
+        self.force_block = new_block(self.comm, solid.layout, fluid.layout)
+        self.blocks: dict[tuple[str, str], PETSc.Mat] = {
+            (fluid.name, solid.name): self.flux_block,
+            (solid.name, fluid.name): self.force_block,
+        }
+        self.touched = self.grid.zeros_cells(dtype=bool)
+        self._positions: np.ndarray | None = None
+        self._faces: list[rays.Hits] = []
+        self._rows: list[Rows] = []
+        self._patterns: list[tuple[np.ndarray, ...]] = []
+        self._stale, self._dt = False, 0.0
+
+    # ---- couple ---------------------------------------------------------------------------------------------
+
+    def couple(self, time: float, dt: float) -> None:
+        """Find the cells and faces that the solid takes, and make D1 H and J; nothing if no point moved."""
+        positions = self.solid.surface_positions()
+        if self._positions is not None and np.array_equal(positions, self._positions):
+            return
+        self._positions = positions.copy()
+        shifts = self._images(positions)
+        hits = self._immerse(positions, shifts)
+        self._faces = [self._solid_faces(a, hits[a], positions, shifts) for a in range(self.dim)]
+        self._point_flux = self._point_fluxes()
+        self._rows = [self._flux_rows(), self._force_rows(positions)]
+        self._stale = True
+        self.n_coupled += 1
+
+    def _images(self, positions: np.ndarray) -> np.ndarray:
+        """Return the shifts by whole periods that bring the surface near this rank's cells, (n, dim)."""
+        low, high = positions.min(axis=0, initial=np.inf), positions.max(axis=0, initial=-np.inf)
+        multiples = []
+        for a in range(self.dim):
+            if not self.box.periodic[a] or len(positions) == 0:
+                multiples.append(range(1))
+                continue
+            centres, dx, period = self.grid.cell_centres(a), self.box.dx[a], self.box.dx[a] * self.box.cells[a]
+            first = int(np.ceil((centres[0] - dx - high[a]) / period))
+            last = int(np.floor((centres[-1] + dx - low[a]) / period))
+            multiples.append(range(first, last + 1))
+        shifts = np.array(list(itertools.product(*multiples)), dtype=float).reshape(-1, self.dim)
+        return shifts * self.box.dx * self.box.cells
+
+    def _immerse(self, positions: np.ndarray, shifts: np.ndarray) -> list[rays.Hits]:
+        """Tell the fluid which cells and faces the solid takes; return the hits along each axis by local face."""
+        grid, void = self.grid, self.surface.void
+        inside = grid.zeros_cells(dtype=np.uint8)
+        crossed = [grid.zeros_faces(a, dtype=np.uint8) for a in range(self.dim)]
+        hits = []
+        for a in range(self.dim):
+            coords = [grid.cell_centres(b) for b in range(self.dim)]
+            # one point more on both ends, as the outermost faces lie beyond the outermost centres
+            c, dx = coords[a], self.box.dx[a]
+            coords[a] = np.concatenate(([c[0] - dx], c, [c[-1] + dx]))
+            found = self._cast(positions, shifts, coords, a)
+            if a == 0:
+                shape = (inside.shape[0] + 2, *inside.shape[1:])
+                inside[rays.windings(found, shape, 0)[1:-1] != 0] = SOLID
+                if void.any():
+                    hole = rays.windings(rays.select(found, void[found.facet]), shape, 0)[1:-1] != 0
+                    inside[hole & (inside == FLUID)] = VOID
+            hits.append(rays.nearest_hits(rays.select(found, ~void[found.facet]), coords, a))
+            crossed[a].reshape(-1)[hits[a].segment] = True
+        if self.box.periodic.any():
+            # an image may round differently from the original, and both sides of a seam must agree
+            grid.exchange_cells(inside)
+            for a in range(self.dim):
+                grid.exchange_faces(a, crossed[a])
+        self.fluid.immerse(inside, [c.view(bool) for c in crossed])
+        return hits
+
+    def _cast(self, positions: np.ndarray, shifts: np.ndarray, coords: list[np.ndarray], axis: int) -> rays.Crossings:
+        """Return the crossings of lattice lines with the surface and its periodic images."""
+        parts = [rays.cast(positions + shift, self.surface.facets, coords, axis) for shift in shifts]
+        if len(parts) == 1:
+            return parts[0]
+        nothing = rays.cast(positions, self.surface.facets[:0], coords, axis)
+        return rays.Crossings(*(np.concatenate(columns) for columns in zip(nothing, *parts, strict=True)))
+
+    def _solid_faces(self, axis: int, hits: rays.Hits, positions: np.ndarray, shifts: np.ndarray) -> rays.Hits:
+        """Return every SOLID_FACE along an axis with the place on the surface that moves it."""
+        kind = self.fluid.face_kind[axis]
+        faces = np.flatnonzero(kind.reshape(-1) == SOLID_FACE)
+        facet = np.zeros(len(faces), dtype=np.int32)
+        weights = np.zeros((len(faces), self.dim))
+        at = np.searchsorted(hits.segment, faces)
+        at[at == len(hits.segment)] = 0
+        hit = hits.segment[at] == faces if len(hits.segment) else np.zeros(len(faces), dtype=bool)
+        facet[hit], weights[hit] = hits.facet[at[hit]], hits.weights[at[hit]]
+        lost = np.flatnonzero(~hit)
+        if len(lost):
+            index = np.unravel_index(faces[lost], kind.shape)
+            lines = [self.grid.face_coords(a) if a == axis else self.grid.cell_centres(a) for a in range(self.dim)]
+            middle = np.column_stack([line[i] for line, i in zip(lines, index, strict=False)])
+            wet = self.surface.facets[self.wet]
+            images = np.concatenate([positions + shift for shift in shifts])
+            facets = np.concatenate([wet + n * len(positions) for n in range(len(shifts))])
+            nearest, weights[lost] = rays.nearest_on_facets(images, facets, middle)
+            facet[lost] = self.wet[nearest % len(wet)]
+        return rays.Hits(faces, facet, weights)
+
+    # ---- the operators --------------------------------------------------------------------------------------
+
+    def _point_fluxes(self) -> csr_matrix:
+        """Return the net outflow of this rank's fluid cells by surface point velocity; mark the touched cells.
+
+        Shape (local pressures, n_points * dim), m^2 (m in 2D).
+        """
+        grid, layout, kind = self.grid, self.fluid.layout, self.fluid.cell_kind
+        owned = np.zeros(kind.shape, dtype=bool)
+        owned[grid.owned(None)] = True
+        free = np.diff(self._free_map.indptr) > 0
+        self.touched[...] = False
+        rows, cols, values = [], [], []
+        for a, faces in enumerate(self._faces):
+            points = self.surface.facets[faces.facet] * self.dim + a
+            moves = np.any(free[points] & (faces.weights != 0.0), axis=1)
+            above = np.array(np.unravel_index(faces.segment, self.fluid.face_kind[a].shape))
+            below = above.copy()
+            below[a] -= 1
+            for cell, sign in ((above, -1.0), (below, 1.0)):
+                local = np.flatnonzero((cell[a] >= 0) & (cell[a] < kind.shape[a]))
+                local = local[kind[tuple(cell[:, local])] == FLUID]
+                self.touched[tuple(cell[:, local[moves[local]]])] = True
+                mine = local[owned[tuple(cell[:, local])]]
+                rows.append(np.repeat(grid.index[tuple(cell[:, mine])] - layout.start, self.dim))
+                cols.append(points[mine].reshape(-1))
+                values.append(sign * grid.face_area(a) * faces.weights[mine].reshape(-1))
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
+        return csr_matrix(entries, shape=(layout.n_local, self._free_map.shape[0]))
+
+    def _flux_rows(self) -> Rows:
+        """Return this rank's rows of D1 H."""
+        flux = (self._point_flux @ self._free_map).tocsr()
+        flux.sort_indices()
+        return flux.indptr.astype(IntType), self._free[flux.indices].astype(IntType), flux.data
+
+    def _force_rows(self, positions: np.ndarray) -> Rows:
+        """Return this rank's rows of -J. Collective."""
+        facets = self.surface.facets[self.wet]
+        usable = (self.fluid.cell_kind == FLUID) & (self.grid.index >= 0)
+        shape_weights, stencils = pressure_integrals(positions, facets, self.box, usable, self.quadrature)
+        # point * dim + axis by facet * dim + corner: each corner's force is along the facet's normal
+        n, dim = len(facets), self.dim
+        corner = np.broadcast_to(np.arange(n * dim).reshape(n, dim, 1), (n, dim, dim))
+        point = facets[:, :, None] * dim + np.arange(dim)
+        normal = np.broadcast_to(area_normals(positions, facets)[:, None, :], (n, dim, dim))
+        spread = csr_matrix((normal.ravel(), (point.ravel(), corner.ravel())), shape=(self._free_map.shape[0], n * dim))
+        force = ((self._free_map.T @ spread) @ (shape_weights @ stencils)).tocoo()
+        cells = self.grid.index.reshape(-1)[force.col]
+        return gather_triplets(self.comm, self.solid.layout, self._free[force.row], cells, force.data)
+
+    # ---- assemble and accept --------------------------------------------------------------------------------
+
+    def assemble(self, time: float, dt: float) -> None:
+        """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
+        # whoever solves may scale the blocks in place, by amounts that depend on dt
+        if self._stale or dt != self._dt:
+            patterns: list[tuple[np.ndarray, ...]] = [rows[:2] for rows in self._rows]
+            new = 0
+            for bit, pattern in enumerate(patterns):
+                if not self._patterns or not all(map(np.array_equal, pattern, self._patterns[bit])):
+                    new |= 1 << bit
+            new = self.comm.allreduce(new, op=MPI.BOR)
+            for bit, block in enumerate((self.flux_block, self.force_block)):
+                set_csr(block, *self._rows[bit], new_pattern=bool(new >> bit & 1))
+            self._patterns = patterns
+            self.pattern_version += new > 0
+            self.n_assembled += 1
+            self._stale, self._dt = False, dt
+        if self.surface.fixed_map.nnz:
+            self.fluid.rhs -= self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+
+    def accept(self, time: float, dt: float) -> None:
+        """Give the faces that the solid took its new velocity, in ghosts, too."""
+        velocity = self.solid.surface_velocity()
+        for a, faces in enumerate(self._faces):
+            moved = np.sum(faces.weights * velocity[self.surface.facets[faces.facet], a], axis=1)
+            self.fluid.boundary_velocity[a].reshape(-1)[faces.segment] = moved

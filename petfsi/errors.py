@@ -1,0 +1,19 @@
+"""The errors a user meets, each with the exit code it ends in."""
+
+
+class PetfsiError(Exception):
+    """Something a user can act on; its text stands alone, without a traceback."""
+
+    exit_code = 1
+
+
+class InputError(PetfsiError):
+    """The scene, a mesh, an option or a run directory is wrong: exit code 2, nothing written."""
+
+    exit_code = 2
+
+
+class SolveError(PetfsiError):
+    """A solve failed or the state blew up: exit code 3."""
+
+    exit_code = 3

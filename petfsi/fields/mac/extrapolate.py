@@ -1,0 +1,119 @@
+"""Values for the band of faces or cells around those where the flow is determined."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from numba import njit
+
+from petfsi.fields.mac.grid import MacGrid
+
+#: Layers of a band: more than the ghost width, so that whatever a departure point meets is filled.
+LAYERS = 6
+#: Layers between two exchanges; ghosts are worked on redundantly, each layer spoiling one from outside.
+BATCH = 3
+#: The layer of entries that no layer reaches, and of those outside the domain.
+FAR = 255
+
+
+@njit(cache=True)
+def _unknown(known, part):
+    """Return the flat indices of entries of a part of the array that are not known."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    _, n1, n2 = known.shape
+    count = 0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                count += not known[i, j, k]
+    found = np.empty(count, np.int64)
+    count = 0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if not known[i, j, k]:
+                    found[count] = (i * n1 + j) * n2 + k
+                    count += 1
+    return found
+
+
+@njit(cache=True)
+def _mark(layer, entries, strides, number):
+    """Give ``number`` to those entries without a layer that have a neighbour in a lower one."""
+    for entry in entries:
+        if layer[entry] == FAR:
+            for s in strides:
+                if layer[entry - s] < number or layer[entry + s] < number:
+                    layer[entry] = number
+                    break
+
+
+@njit(cache=True)
+def _average(q, layer, entries, strides):
+    """Set entries of one layer to the mean of their neighbours in lower ones."""
+    for entry in entries:
+        total, count = 0.0, 0
+        for s in strides:
+            if layer[entry - s] < layer[entry]:
+                total += q[entry - s]
+                count += 1
+            if layer[entry + s] < layer[entry]:
+                total += q[entry + s]
+                count += 1
+        q[entry] = total / count
+
+
+class Band:
+    """The layers of undetermined faces of an axis (or cells: None) next to determined ones.
+
+    An entry's layer is its distance from the known entries, in steps along the grid; it takes the mean of its
+    neighbours in lower layers, so the result does not depend on the ranks.
+
+    Attributes
+    ----------
+    layer : ndarray of uint8
+        Zero where known, up to ``LAYERS`` in the band, ``FAR`` elsewhere.
+    empty : bool
+        Whether everything is known, on all ranks.
+    """
+
+    def __init__(self, grid: MacGrid, axis: int | None):
+        self.grid, self.axis = grid, axis
+        self.empty = True
+        shape = grid.shape(axis)
+        self.layer = np.full(shape, FAR, dtype=np.uint8)
+        self._strides = tuple((shape[1] * shape[2], shape[2], 1)[: grid.dim])
+        self._lists: list[np.ndarray] = []
+        # entries at the very end of the array have no neighbours there; the exchange fills them
+        self._part = tuple(
+            (max(s.start, 1), min(s.stop, n - 1)) if b < grid.dim else (0, 1)
+            for b, (s, n) in enumerate(zip(grid.inside(axis), shape, strict=True))
+        )
+
+    def rebuild(self, known: np.ndarray) -> None:
+        """Find the layers anew; ``known`` is valid in all ghosts. Collective."""
+        inside = self.grid.inside(self.axis)
+        self.layer[inside] = np.where(known[inside], 0, FAR)
+        entries = _unknown(known, self._part)
+        self.empty = not self.grid.comm.allreduce(len(entries) > 0, op=MPI.LOR)
+        if self.empty:
+            return
+        flat = self.layer.reshape(-1)
+        for first in range(1, LAYERS + 1, BATCH):
+            for number in range(first, first + BATCH):
+                _mark(flat, entries, self._strides, number)
+            self.grid.halo.exchange(self.layer, self.axis)
+        layers = flat[entries]
+        order = np.argsort(layers, kind="stable")
+        ends = np.searchsorted(layers[order], np.arange(1, LAYERS + 2))
+        self._lists = [entries[order[a:b]] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    def fill(self, q: np.ndarray) -> None:
+        """Fill the band of an array whose known entries are valid in all ghosts. Collective."""
+        if self.empty:
+            return
+        flat = q.reshape(-1)
+        for first in range(0, LAYERS, BATCH):
+            for entries in self._lists[first : first + BATCH]:
+                _average(flat, self.layer.reshape(-1), entries, self._strides)
+            self.grid.halo.exchange(q, self.axis)

@@ -1,0 +1,69 @@
+"""What cells and faces are, given the static sides and obstacles and the solids of the moment."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+# cells
+FLUID = 0
+SOLID = 1  # inside a deformable solid
+OBSTACLE = 2
+VOID = 3  # in an empty cavity: p = 0, not solved
+OUTSIDE = 4  # beyond a side
+
+# faces
+DEAD = 0  # the velocity is not determined
+PRESSURE = 1  # between two fluid cells
+OPEN = 2  # between fluid and an open side: p = 0 at the face
+WALL = 3  # velocity prescribed by a side, an inflow or an obstacle
+SOLID_FACE = 4  # velocity given by a coupling
+
+#: Unit steps along the axes, for kernels that serve every axis.
+STEP = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
+
+@njit(cache=True)
+def classify_faces(cell_kind, side_kind, crossed, step, face_kind):
+    """Write the kind of every local face whose two cells are local, too.
+
+    Parameters
+    ----------
+    cell_kind : ndarray of uint8
+        Cell array.
+    side_kind : ndarray of uint8
+        Face array: OPEN or WALL on the sides of the domain; not read elsewhere.
+    crossed : ndarray of bool
+        Face array: a solid's surface passes between the two cells' centres. Wins over everything else.
+    step : tuple of int
+        The unit step along the faces' axis.
+    face_kind : ndarray of uint8
+        Face array, the result; its first and last plane along the axis are left alone.
+    """
+    di, dj, dk = step
+    n0, n1, n2 = cell_kind.shape
+    for i in range(di, n0):
+        for j in range(dj, n1):
+            for k in range(dk, n2):
+                below = cell_kind[i - di, j - dj, k - dk]
+                above = cell_kind[i, j, k]
+                if below != FLUID and above != FLUID:
+                    kind = DEAD
+                elif crossed[i, j, k]:
+                    kind = SOLID_FACE
+                elif below == above:
+                    kind = PRESSURE
+                else:
+                    other = above if below == FLUID else below
+                    if other == OBSTACLE:
+                        kind = WALL
+                    elif other == OUTSIDE:
+                        kind = side_kind[i, j, k]
+                    else:
+                        kind = SOLID_FACE
+                face_kind[i, j, k] = kind
+
+
+def merge_cells(static: np.ndarray, inside: np.ndarray | None) -> np.ndarray:
+    """Return the kind of each cell: what is static (obstacles, outside) wins over what a solid covers."""
+    return static.copy() if inside is None else np.where(static == FLUID, inside, static)

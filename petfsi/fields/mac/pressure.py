@@ -1,0 +1,227 @@
+"""The pressure block L = -(dt/rho) D2 G, its right-hand side, and the projection with its solution.
+
+D is the net outflow of a cell in m^3/s, G the difference of the two cells at a face by their distance; at an OPEN
+face p = 0 lies half a cell away.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from petfsi.fields.mac.grid import MacGrid
+from petfsi.fields.mac.kinds import DEAD, FLUID, OPEN, PRESSURE, SOLID_FACE, STEP, WALL
+from petfsi.petsc import IntType
+
+#: Diagonal of rows that are not solved, as a part of the usual one: small, for the sake of multigrid.
+INACTIVE_DIAGONAL = 0.05
+
+
+class Pattern:
+    """The 5- or 7-point pattern, the same for the whole run.
+
+    Attributes
+    ----------
+    indptr, indices : ndarray of IntType
+        Local rows in the DMDA's order; global columns, sorted.
+    slot : ndarray of int64, shape (n_rows, 1 + 2 dim)
+        Where the entries of a row stand: itself, then the neighbour below and above per axis; -1 for none.
+    """
+
+    def __init__(self, grid: MacGrid):
+        steps = [(0, 0, 0)]
+        for unit in STEP[: grid.dim]:
+            steps += [(-unit[0], -unit[1], -unit[2]), unit]
+        part = grid.owned(None)
+        columns = np.empty((grid.layout.n_local, len(steps)), dtype=IntType)
+        for c, shifts in enumerate(steps):
+            shifted = tuple(slice(p.start + s, p.stop + s) for p, s in zip(part, shifts, strict=True))
+            columns[:, c] = grid.index[shifted].ravel(order="F")
+        order = np.argsort(columns, axis=1, kind="stable")
+        columns = np.take_along_axis(columns, order, axis=1)
+        present = columns >= 0
+        self.indptr = np.zeros(len(columns) + 1, dtype=IntType)
+        np.cumsum(present.sum(axis=1), out=self.indptr[1:])
+        self.indices = columns[present]
+        place = np.full(columns.shape, -1, dtype=np.int64)
+        place[present] = np.arange(len(self.indices))
+        self.slot = np.empty_like(place)
+        np.put_along_axis(self.slot, order, place, axis=1)
+
+
+@njit(cache=True)
+def active_cells(cell_kind, kind0, kind1, kind2, flat):
+    """Return the cell array of fluid cells that are solved: those with any face that the pressure can act on."""
+    n0, n1, n2 = cell_kind.shape
+    active = np.zeros(cell_kind.shape, np.bool_)
+    for i in range(n0):
+        for j in range(n1):
+            for k in range(n2):
+                if cell_kind[i, j, k] != FLUID:
+                    continue
+                free = _acts(kind0[i, j, k]) or _acts(kind0[i + 1, j, k])
+                free = free or _acts(kind1[i, j, k]) or _acts(kind1[i, j + 1, k])
+                if not flat:
+                    free = free or _acts(kind2[i, j, k]) or _acts(kind2[i, j, k + 1])
+                active[i, j, k] = free
+    return active
+
+
+@njit(cache=True)
+def _acts(kind):
+    return kind != WALL and kind != DEAD
+
+
+@njit(cache=True)
+def _conductance(kind, c):
+    """Return what a face adds to the diagonal; c is dt/rho * area / dx."""
+    if kind == PRESSURE:
+        return c
+    if kind == OPEN:
+        return 2.0 * c
+    return 0.0
+
+
+@njit(cache=True)
+def laplacian(active, kind0, kind1, kind2, part, slot, c, values):
+    """Write all values of L.
+
+    Parameters
+    ----------
+    active : ndarray of bool
+        Cell array.
+    kind0, kind1, kind2 : ndarray of uint8
+        Face kinds; in 2D the last is not read.
+    part : tuple of (int, int)
+        The owned cells.
+    slot : ndarray
+        See ``Pattern``.
+    c : ndarray, shape (dim,)
+        dt/rho * area / dx per axis.
+    values : ndarray
+        The result, along the pattern's indices.
+    """
+    (b0, e0), (b1, e1), (b2, e2) = part
+    flat = len(c) == 2
+    usual = 2.0 * c.sum()
+    below = np.zeros(3)
+    above = np.zeros(3)
+    kinds_below = np.zeros(3, np.uint8)
+    kinds_above = np.zeros(3, np.uint8)
+    for k in range(b2, e2):
+        for j in range(b1, e1):
+            for i in range(b0, e0):
+                row = (i - b0) + (e0 - b0) * ((j - b1) + (e1 - b1) * (k - b2))
+                kinds_below[0], kinds_above[0] = kind0[i, j, k], kind0[i + 1, j, k]
+                kinds_below[1], kinds_above[1] = kind1[i, j, k], kind1[i, j + 1, k]
+                if not flat:
+                    kinds_below[2], kinds_above[2] = kind2[i, j, k], kind2[i, j, k + 1]
+                diagonal = 0.0
+                for a in range(len(c)):
+                    below[a] = c[a] if active[i, j, k] and kinds_below[a] == PRESSURE else 0.0
+                    above[a] = c[a] if active[i, j, k] and kinds_above[a] == PRESSURE else 0.0
+                    diagonal += _conductance(kinds_below[a], c[a]) + _conductance(kinds_above[a], c[a])
+                    if slot[row, 1 + 2 * a] >= 0:
+                        values[slot[row, 1 + 2 * a]] = -below[a]
+                    if slot[row, 2 + 2 * a] >= 0:
+                        values[slot[row, 2 + 2 * a]] = -above[a]
+                values[slot[row, 0]] = diagonal if active[i, j, k] else INACTIVE_DIAGONAL * usual
+
+
+@njit(cache=True)
+def _flux(star, bound, kind, i, j, k):
+    """Return the known velocity through a face that counts on the right-hand side."""
+    if kind[i, j, k] == PRESSURE or kind[i, j, k] == OPEN:
+        return star[i, j, k]
+    if kind[i, j, k] == WALL:
+        return bound[i, j, k]
+    return 0.0
+
+
+@njit(cache=True)
+def known_inflow(active, star, bound, kind, step, area, part, out):
+    """Add minus the net outflow through one axis' faces, without SOLID_FACEs, to ``out`` in the DMDA's order."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    di, dj, dk = step
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if active[i, j, k]:
+                    row = (i - b0) + (e0 - b0) * ((j - b1) + (e1 - b1) * (k - b2))
+                    above = _flux(star, bound, kind, i + di, j + dj, k + dk)
+                    out[row] -= area * (above - _flux(star, bound, kind, i, j, k))
+
+
+@njit(cache=True)
+def project(star, p, bound, kind, step, c, part, out):
+    """Write the new velocity on the owned faces of one axis; zero on DEAD ones.
+
+    v = v* - (dt/rho) G p on PRESSURE and OPEN faces, with c = dt / (rho dx) and p = 0 outside; elsewhere as given.
+    """
+    (b0, e0), (b1, e1), (b2, e2) = part
+    di, dj, dk = step
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                here = kind[i, j, k]
+                if here == PRESSURE:
+                    out[i, j, k] = star[i, j, k] - c * (p[i, j, k] - p[i - di, j - dj, k - dk])
+                elif here == OPEN:
+                    out[i, j, k] = star[i, j, k] - 2.0 * c * (p[i, j, k] - p[i - di, j - dj, k - dk])
+                elif here == WALL or here == SOLID_FACE:
+                    out[i, j, k] = bound[i, j, k]
+                else:
+                    out[i, j, k] = 0.0
+
+
+@njit(cache=True)
+def add_forces(star, bound, kind, step, dv, smoke, dv_smoke, part):
+    """Accelerate the owned faces of one axis by dv + dv_smoke * (smoke at the face); WALL faces take ``bound``."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    di, dj, dk = step
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if kind[i, j, k] == WALL:
+                    star[i, j, k] = bound[i, j, k]
+                else:
+                    star[i, j, k] += dv
+                    if dv_smoke != 0.0:
+                        mean = 0.5 * (smoke[i, j, k] + smoke[i - di, j - dj, k - dk])
+                        star[i, j, k] += dv_smoke * mean
+
+
+@njit(cache=True)
+def outflow(u, v, w, i, j, k, areas):
+    """Return the net outflow of a cell, m^3/s; ``areas`` has dim entries."""
+    total = areas[0] * (u[i + 1, j, k] - u[i, j, k]) + areas[1] * (v[i, j + 1, k] - v[i, j, k])
+    if len(areas) == 3:
+        total += areas[2] * (w[i, j, k + 1] - w[i, j, k])
+    return total
+
+
+@njit(cache=True)
+def largest_outflow(active, u, v, w, areas, part):
+    """Return the largest magnitude of the net outflow of the solved cells, m^3/s."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    most = 0.0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if active[i, j, k]:
+                    most = max(most, abs(outflow(u, v, w, i, j, k, areas)))
+    return most
+
+
+@njit(cache=True)
+def sum_of_squares(cell_kind, v, step, part):
+    """Return half the sum of v^2 of the two faces of each fluid cell along one axis, m^2/s^2."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    di, dj, dk = step
+    total = 0.0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if cell_kind[i, j, k] == FLUID:
+                    total += 0.5 * (v[i, j, k] ** 2 + v[i + di, j + dj, k + dk] ** 2)
+    return total

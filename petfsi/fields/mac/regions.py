@@ -1,0 +1,140 @@
+"""Connected regions of fluid, across ranks and periodic borders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.kinds import OPEN, PRESSURE
+
+
+@njit(cache=True)
+def _root(parent, a):
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = parent[a]
+    return a
+
+
+@njit(cache=True)
+def _join(parent, a, b):
+    a, b = _root(parent, a), _root(parent, b)
+    # the smaller number is the root, so that the first cell met stands for its region
+    if a < b:
+        parent[b] = a
+    else:
+        parent[a] = b
+
+
+@njit(cache=True)
+def _label(active, kind0, kind1, kind2, part, flat, labels):
+    """Write the number of each cell's region on this rank, in the order of first cells; return those cells, flat."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    m1, m2 = e1 - b1, e2 - b2
+    parent = np.arange((e0 - b0) * m1 * m2)
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                c = ((i - b0) * m1 + j - b1) * m2 + k - b2
+                if i > b0 and kind0[i, j, k] == PRESSURE:
+                    _join(parent, c, c - m1 * m2)
+                if j > b1 and kind1[i, j, k] == PRESSURE:
+                    _join(parent, c, c - m2)
+                if not flat and k > b2 and kind2[i, j, k] == PRESSURE:
+                    _join(parent, c, c - 1)
+    number = np.full(len(parent), -1)
+    first = np.empty(len(parent), np.int64)
+    count = 0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if not active[i, j, k]:
+                    continue
+                c = ((i - b0) * m1 + j - b1) * m2 + k - b2
+                root = _root(parent, c)
+                if number[root] < 0:
+                    number[root] = count
+                    first[count] = c
+                    count += 1
+                labels[i, j, k] = number[root]
+    return first[:count].copy()
+
+
+@dataclass(frozen=True)
+class Regions:
+    """The closed regions: those without an OPEN face.
+
+    Attributes
+    ----------
+    members : list of ndarray
+        Per region 1 for its cells on this rank and 0 for the others, in the DMDA's order. Regions are in the order
+        of their first cells in the global grid, on any number of ranks.
+    """
+
+    grid: MacGrid
+    members: list[np.ndarray]
+
+    def touching(self, touched: np.ndarray | None) -> list[bool]:
+        """Return for each region whether any rank has one of its cells marked. Collective."""
+        if touched is None or not self.members:
+            return [False] * len(self.members)
+        marked = self.grid.to_vec(touched).astype(float)
+        here = np.array([marked @ vec > 0 for vec in self.members])
+        return [bool(t) for t in np.logical_or.reduce(self.grid.comm.allgather(here))]
+
+
+def find_regions(grid: MacGrid, active: np.ndarray, face_kind: list[np.ndarray]) -> Regions:
+    """Return the closed regions among the active cells. Collective."""
+    comm = grid.comm
+    labels = np.full(grid.shape(None), -1, dtype=np.int64)
+    own = grid.owned(None)
+    part = tuple((s.start, s.stop) for s in own)
+    kind_x, kind_y, kind_z = three(face_kind)
+    first = _label(active, kind_x, kind_y, kind_z, part, grid.dim == 2, labels)
+    place = np.unravel_index(first, grid.owned_shape)
+    natural = np.ravel_multi_index([p + m for p, m in zip(place, grid.lo, strict=True)], grid.cells)
+    counts = comm.allgather(len(first))
+    offset = sum(counts[: comm.rank])
+    labels[labels >= 0] += offset
+    grid.exchange_cells(labels, width=1)
+
+    pairs = _pairs(grid, labels, face_kind)
+    is_open = np.zeros(len(first), dtype=bool)
+    for axis, kind in enumerate(face_kind):
+        for shift in (0, 1):
+            faces = list(own)
+            faces[axis] = slice(own[axis].start + shift, own[axis].stop + shift)
+            at = labels[own][kind[tuple(faces)] == OPEN]
+            is_open[at[at >= 0] - offset] = True
+
+    links = np.concatenate(comm.allgather(pairs))
+    total = sum(counts)
+    if total == 0:
+        return Regions(grid, [])
+    graph = coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(total, total))
+    n_regions, region = connected_components(graph, directed=False)
+    has_exit = np.bincount(region, np.concatenate(comm.allgather(is_open)), n_regions) > 0
+    begin = np.full(n_regions, np.iinfo(np.int64).max)
+    np.minimum.at(begin, region, np.concatenate(comm.allgather(natural)))
+    closed = [r for r in np.argsort(begin, kind="stable") if not has_exit[r]]
+    label = grid.to_vec(labels)
+    mine = np.where(label >= 0, region[label], -1)
+    return Regions(grid, [(mine == r).astype(float) for r in closed])
+
+
+def _pairs(grid: MacGrid, labels: np.ndarray, face_kind: list[np.ndarray]) -> np.ndarray:
+    """Return the label pairs that meet across the lower border of this rank's cells, each once."""
+    found = [np.empty((0, 2), dtype=np.int64)]
+    for axis, kind in enumerate(face_kind):
+        plane = list(grid.owned(None))
+        plane[axis] = slice(grid.ghost[axis], grid.ghost[axis] + 1)
+        behind = list(plane)
+        behind[axis] = slice(grid.ghost[axis] - 1, grid.ghost[axis])
+        joined = kind[tuple(plane)] == PRESSURE
+        found.append(np.stack([labels[tuple(plane)][joined], labels[tuple(behind)][joined]], axis=1))
+    return np.unique(np.concatenate(found), axis=0)

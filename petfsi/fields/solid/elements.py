@@ -1,0 +1,203 @@
+"""Linear triangles and tetrahedra, total Lagrangian: from displacements to A, b and energies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+from numba import njit
+
+from petfsi.fields.solid.materials import Material
+from petfsi.fields.solid.pattern import Pattern
+from petfsi.integrators import Coefficients
+
+#: Elements handled at a time: their tangents stay in a core's cache.
+CHUNK = 512
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """What bodies are made of; arrays have one entry per body.
+
+    Attributes
+    ----------
+    density : ndarray
+        kg/m^3.
+    lame, mu : ndarray
+        Pa.
+    material : list of Material
+    lumped : ndarray of bool
+        Whether the mass matrix is diagonal.
+    mass_damping, stiffness_damping : ndarray
+        Rayleigh's factors, 1/s and s.
+    """
+
+    density: np.ndarray
+    lame: np.ndarray
+    mu: np.ndarray
+    material: list[Material]
+    lumped: np.ndarray
+    mass_damping: np.ndarray
+    stiffness_damping: np.ndarray
+
+
+class Elements:
+    """Constant-strain elements of any number of bodies.
+
+    With N_a the shape functions, g_a = grad N_a and F = I + sum_a d_a g_a^T, constant in an element of volume V,
+
+        K_a[i] = V P[i,J] g_a[J],    K'_ab[i,k] = V g_a[J] C[i,J,k,L] g_b[L],
+        M_ab = density V (1 + delta_ab) / ((dim + 1)(dim + 2))   or, lumped,   density V delta_ab / (dim + 1).
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, dim)
+        Reference positions, m.
+    cells : ndarray of int32, shape (ne, dim + 1)
+        Sorted by body.
+    body : ndarray of int32, shape (ne,)
+    bodies : Bodies
+    """
+
+    def __init__(self, points: np.ndarray, cells: np.ndarray, body: np.ndarray, bodies: Bodies):
+        self.dim = points.shape[1]
+        self.cells = cells
+        self.body = body
+        self.bodies = bodies
+        edges = points[cells[:, 1:]] - points[cells[:, :1]]
+        self.volume = np.linalg.det(edges) / (2.0 if self.dim == 2 else 6.0)
+        rest = np.linalg.inv(edges).transpose(0, 2, 1)
+        self.gradients = np.concatenate((-rest.sum(axis=1, keepdims=True), rest), axis=1)
+        corners = self.dim + 1
+        off = np.where(bodies.lumped, 0.0, 1 / (corners * (corners + 1)))
+        # per body: factors of density * V on and off the diagonal of an element's mass matrix
+        self.mass_factors = np.column_stack((1 / corners - off * self.dim, off))
+        self._kernels = _KERNELS[self.dim]
+
+    def chunks(self) -> list[tuple[int, int, int]]:
+        """Return (begin, end, body) of runs of at most ``CHUNK`` elements of one body."""
+        ends = np.searchsorted(self.body, np.arange(len(self.bodies.density) + 1))
+        return [
+            (k, min(k + CHUNK, int(end)), b)
+            for b, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True))
+            for k in range(int(begin), int(end), CHUNK)
+        ]
+
+    def deformation_gradients(self, d: np.ndarray, begin: int = 0, end: int | None = None) -> np.ndarray:
+        """Return F of elements ``begin`` to ``end``, shape (count, dim, dim); ``d`` holds all local nodes."""
+        return self._kernels.gradient(self.cells[begin:end], self.gradients[begin:end], d)
+
+    def respond(self, d: np.ndarray, begin: int, end: int, body: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return energy density, stress and tangent of elements of one body."""
+        F = self.deformation_gradients(d, begin, end)
+        lame, mu = np.full(len(F), self.bodies.lame[body]), np.full(len(F), self.bodies.mu[body])
+        return self.bodies.material[body](F, lame, mu)
+
+    def assemble(
+        self, d: np.ndarray, u: np.ndarray, step: Coefficients, pattern: Pattern, values: np.ndarray, b: np.ndarray
+    ) -> None:
+        """Fill A's values and b with  A_M M + A_K K'  and  b_M M u - b_K K' u - K(d). Not collective.
+
+        Parameters
+        ----------
+        d, u : ndarray, shape (n, dim)
+            Displacement and velocity of all local nodes.
+        step : Coefficients
+            Of the integrator, per body.
+        pattern : Pattern
+        values : ndarray, shape (len(pattern.indices),)
+            Overwritten.
+        b : ndarray, shape (n_owned, dim)
+            Overwritten.
+        """
+        values[:] = 0.0
+        b[:] = 0.0
+        table = np.empty((len(self.bodies.density), 4))
+        for column, factor in enumerate((step.A_M, step.A_K, step.b_M, step.b_K)):
+            table[:, column] = factor
+        for begin, end, body in self.chunks():
+            _, P, C = self.respond(d, begin, end, body)
+            part = slice(begin, end)
+            self._kernels.scatter(
+                self.cells[part], self.gradients[part], self.volume[part], P, C, u,
+                self.bodies.density[body] * self.mass_factors[body], table[body],
+                pattern.node_ptr, pattern.slots[part], values, b,
+            )  # fmt: skip
+
+    def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
+        """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
+        kinetic = elastic = 0.0
+        for begin, end, body in self.chunks():
+            V = np.where(counted[begin:end], self.volume[begin:end], 0.0)
+            elastic += float(V @ self.respond(d, begin, end, body)[0])
+            v = u[self.cells[begin:end]]
+            on, off = self.mass_factors[body]
+            squares = (on - off) * np.einsum("eai,eai->e", v, v) + off * np.sum(v.sum(axis=1) ** 2, axis=1)
+            kinetic += float(0.5 * self.bodies.density[body] * (V @ squares))
+        return kinetic, elastic
+
+    def nodal_mass(self, n: int) -> np.ndarray:
+        """Return the mass of each of the first ``n`` nodes: the row sums of M, in kg."""
+        share = np.repeat(self.bodies.density[self.body] * self.volume / (self.dim + 1), self.dim + 1)
+        return np.bincount(self.cells.ravel(), weights=share, minlength=n)[:n]
+
+
+def _compile(dim: int) -> SimpleNamespace:
+    # dim as a constant of the closure lets the compiler unroll the loops over axes and corners
+
+    @njit(cache=True)
+    def gradient(cells, gradients, d):
+        F = np.empty((cells.shape[0], dim, dim))
+        for e in range(cells.shape[0]):
+            for i in range(dim):
+                for J in range(dim):
+                    F[e, i, J] = 1.0 if i == J else 0.0
+                    for a in range(dim + 1):
+                        F[e, i, J] += d[cells[e, a], i] * gradients[e, a, J]
+        return F
+
+    @njit(cache=True)
+    def scatter(cells, gradients, volume, P, C, u, mass, step, node_ptr, slots, values, b):
+        A_M, A_K, b_M, b_K = step
+        Cg = np.empty((dim, dim, dim))
+        for e in range(cells.shape[0]):
+            V = volume[e]
+            for q in range(dim + 1):
+                column = cells[e, q]
+                for i in range(dim):
+                    for J in range(dim):
+                        for k in range(dim):
+                            s = 0.0
+                            for L in range(dim):
+                                s += C[e, i, J, k, L] * gradients[e, q, L]
+                            Cg[i, J, k] = V * s
+                for a in range(dim + 1):
+                    row = cells[e, a]
+                    slot = slots[e, a, q]
+                    if slot < 0:
+                        continue
+                    begin = node_ptr[row]
+                    width = dim * (node_ptr[row + 1] - begin)
+                    start = dim * (dim * begin + slot - begin)
+                    m = V * (mass[0] if a == q else mass[1])
+                    for i in range(dim):
+                        for k in range(dim):
+                            stiffness = 0.0
+                            for J in range(dim):
+                                stiffness += gradients[e, a, J] * Cg[i, J, k]
+                            entry = A_K * stiffness
+                            load = -b_K * stiffness
+                            if i == k:
+                                entry += A_M * m
+                                load += b_M * m
+                            values[start + i * width + k] += entry
+                            b[row, i] += load * u[column, k]
+                        if a == q:
+                            for J in range(dim):
+                                b[row, i] -= V * P[e, i, J] * gradients[e, a, J]
+
+    return SimpleNamespace(gradient=gradient, scatter=scatter)
+
+
+_KERNELS = {2: _compile(2), 3: _compile(3)}

@@ -1,0 +1,266 @@
+"""Simplex meshes: structured boxes, files, and the checks that both must pass."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar, cast
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from petfsi.errors import InputError
+from petfsi.geometry.shapes import inside
+from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
+from petfsi.scene.schema import Box, Shape, Solid
+
+if TYPE_CHECKING:  # meshes can be checked without starting MPI
+    from mpi4py import MPI
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+#: A cell is degenerate below this fraction of its longest edge to the power dim.
+FLAT = 1e-12
+#: Points coincide within this fraction of the mesh's extent.
+COINCIDENT = 1e-10
+
+_CELL_TYPE = {2: "triangle", 3: "tetra"}
+_FACET_TYPE = {2: "line", 3: "triangle"}
+
+
+@dataclass(frozen=True)
+class SimplexMesh:
+    """Triangles or tetrahedra of one or more bodies, positively oriented.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, dim)
+        m; each body has its own.
+    cells : ndarray of int, shape (ne, dim + 1)
+    body : ndarray of int, shape (ne,)
+        The body each cell belongs to.
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    body: np.ndarray
+
+    @classmethod
+    def union(cls, meshes: list[tuple[np.ndarray, np.ndarray]]) -> SimplexMesh:
+        """Return the disjoint union of (points, cells) pairs, body after body."""
+        offsets = np.concatenate(([0], np.cumsum([len(points) for points, _ in meshes])))
+        return cls(
+            np.concatenate([points for points, _ in meshes]),
+            np.concatenate([cells + offset for (_, cells), offset in zip(meshes, offsets[:-1], strict=True)]),
+            np.repeat(np.arange(len(meshes)), [len(cells) for _, cells in meshes]),
+        )
+
+
+def from_root(comm: MPI.Comm, make: Callable[[], T]) -> T:
+    """Return what rank 0 makes, on all ranks; an InputError there is raised on all. Collective."""
+    result: T | None = None
+    message: str | None = None
+    if comm.rank == 0:
+        try:
+            result = make()
+        except InputError as error:
+            message = str(error)
+    result, message = comm.bcast((result, message))
+    if message is not None:
+        raise InputError(message)
+    return cast(T, result)
+
+
+def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and positively oriented cells of a solid. Not collective.
+
+    Parameters
+    ----------
+    solid : Solid
+        The table; its shape is a box with cells, or a mesh file.
+    dim : int
+        2 for triangles, 3 for tetrahedra.
+    key : str
+        Where the table stands in the scene, for messages: ``"solids.layer"``.
+    directory : Path
+        What a mesh file's path is relative to.
+
+    Raises
+    ------
+    InputError
+        If there is no such mesh or it is not fit for a computation.
+    """
+    shape = solid.shape
+    if shape.mesh is not None:
+        key = f"{key}.shape.mesh"
+        points, cells = read_mesh(shape, dim, key, directory)
+        _check(points, cells, f"{key} = {shape.mesh!r}")
+        return points, cells
+    if shape.box is None or shape.box.cells is None:
+        raise InputError(f"{key}.shape: a solid wants a box with cells, or a mesh file")
+    points, cells = box_mesh(shape.box)
+    if shape.cavity is not None:
+        centre = points[cells].reshape(-1, math.factorial(dim), dim + 1, dim).mean(axis=(1, 2))
+        points, cells = _drop_unused(
+            points, cells[np.repeat(~inside(Shape(box=shape.cavity), centre), math.factorial(dim))]
+        )
+        if len(cells) == 0:
+            raise InputError(f"{key}.shape.cavity: nothing of the box is left outside the cavity")
+        _check_manifold(points, cells, f"{key}.shape.cavity")
+    return points, cells
+
+
+def box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells of a meshed box; the simplices of one grid cell follow each other.
+
+    In 2D the diagonals alternate, so that the mesh has no preferred direction; in 3D every cell falls into the
+    six tetrahedra around its main diagonal (Kuhn), which fit together across cells. Points run with x slowest.
+    """
+    n = np.array(box.cells)
+    axes = [o + s * np.arange(m + 1) / m for o, s, m in zip(box.origin, box.size, n, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(n))
+    stride = np.cumprod(np.concatenate(([1], n[:0:-1] + 1)))[::-1]
+    grid = np.stack(np.meshgrid(*map(np.arange, n), indexing="ij"), axis=-1).reshape(-1, len(n))
+    corner = (grid @ stride)[:, None]
+    if len(n) == 2:
+        a, b, c, d = 0, stride[0], stride[0] + stride[1], stride[1]
+        even = np.array([[a, b, c], [a, c, d]]).ravel()
+        odd = np.array([[a, b, d], [b, c, d]]).ravel()
+        cells = corner + np.where(grid.sum(axis=1, keepdims=True) % 2 == 0, even, odd)
+        return points, cells.reshape(-1, 3)
+    tets = [np.concatenate(([0], np.cumsum(stride[list(path)]))) for path in permutations(range(3))]
+    # every other path around the diagonal is left-handed
+    tets = [
+        t if np.linalg.det(np.eye(3)[list(path)]) > 0 else t[[0, 2, 1, 3]]
+        for t, path in zip(tets, permutations(range(3)), strict=True)
+    ]
+    return points, (corner + np.concatenate(tets)).reshape(-1, 4)
+
+
+def read_mesh(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells of a mesh file, scaled and moved, unused points dropped. Not collective."""
+    points, cells = _read(shape, dim, _CELL_TYPE[dim], key, directory)
+    n_points = len(points)
+    points, cells = _drop_unused(points, cells)
+    if len(points) < n_points:
+        log.info("%s: %d points that belong to no cell are left out", key, n_points - len(points))
+    if np.all(signed_volumes(points, cells) < 0):
+        cells = cells[:, [1, 0, *range(2, dim + 1)]]
+    return points, cells
+
+
+def read_surface(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and facets of a closed surface in a file, normals outward. Not collective.
+
+    Points in the same place are merged, as formats such as STL repeat them.
+
+    Parameters
+    ----------
+    shape : Shape
+        With ``mesh``, ``scale`` and ``translate``.
+    dim : int
+        2 for segments, 3 for triangles.
+    key : str
+        Where the shape stands in the scene, for messages: ``"obstacles.hull.shape"``.
+    directory : Path
+        What the path is relative to.
+    """
+    points, facets = _read(shape, dim, _FACET_TYPE[dim], f"{key}.mesh", directory)
+    where = f"{key}.mesh = {shape.mesh!r}"
+    points, merged = np.unique(points, axis=0, return_inverse=True)
+    facets = merged.ravel()[facets]
+    shared = np.sort(facets, axis=1)
+    _refuse(where, np.count_nonzero(np.any(np.diff(shared, axis=1) == 0, axis=1)), "facets without extent")
+    _refuse(where, np.count_nonzero(occurrences(facets) > 1), "duplicate facets")
+    rim = ridges(facets).reshape(-1, dim - 1)
+    open_ridges = _distinct(rim, occurrences(rim) != 2)
+    _refuse(where, open_ridges, "edges that do not lie between exactly two facets: the surface must be closed")
+    # between two facets that agree, an edge is run through once each way (in 2D: a point is end and start once)
+    ends = rim if dim == 3 else facets[:, :1]
+    _, count = np.unique(ends, axis=0, return_counts=True)
+    _refuse(where, np.count_nonzero(count > 1), "edges at which the facets' orientations disagree")
+    volume = np.linalg.det(points[facets] - points.mean(axis=0)).sum()
+    return _drop_unused(points, facets if volume > 0 else facets[:, ::-1])
+
+
+def _read(shape: Shape, dim: int, cell_type: str, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the cells of one type; whatever a reader does to say no becomes one InputError."""
+    import meshio
+
+    path = Path(directory) / str(shape.mesh)
+    if not path.is_file():
+        raise InputError(f"{key} = {shape.mesh!r}: no file {path}")
+    try:
+        # on a broken file some readers print, warn or even exit
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            mesh = meshio.read(path)
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"{key} = {shape.mesh!r}: cannot be read as a mesh ({error or type(error).__name__})"
+        ) from error
+    blocks = [block.data for block in mesh.cells if block.type == cell_type and len(block.data)]
+    if not blocks:
+        found = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells at all"
+        raise InputError(f"{key} = {shape.mesh!r}: holds no {cell_type} cells, which dim = {dim} wants; found {found}")
+    cells = np.concatenate(blocks).astype(np.int64)
+    points = _as_dim(np.asarray(mesh.points, dtype=float), dim, f"{key} = {shape.mesh!r}")
+    if cells.min() < 0 or cells.max() >= len(points):
+        raise InputError(f"{key} = {shape.mesh!r}: cells name points that the file does not hold")
+    return points * shape.scale + np.array(shape.translate or [0.0] * dim), cells
+
+
+def _as_dim(points: np.ndarray, dim: int, where: str) -> np.ndarray:
+    _refuse(where, np.count_nonzero(~np.isfinite(points).all(axis=1)), "points with a coordinate that is no number")
+    if points.shape[1] < dim:
+        raise InputError(f"{where}: points have {points.shape[1]} coordinates, dim = {dim} wants {dim}")
+    if points.shape[1] > dim and np.ptp(points[:, dim:], axis=0).max() > 1e-9 * np.ptp(points, axis=0).max():
+        raise InputError(f"{where}: the points do not lie in one plane z = constant, as dim = 2 wants")
+    return np.ascontiguousarray(points[:, :dim])
+
+
+def _drop_unused(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    used, numbered = np.unique(cells, return_inverse=True)
+    return points[used], numbered.reshape(cells.shape)
+
+
+def _refuse(where: str, count: int, what: str) -> None:
+    if count:
+        raise InputError(f"{where}: {count} {what}")
+
+
+def _distinct(tuples: np.ndarray, chosen: np.ndarray) -> int:
+    return len(np.unique(np.sort(tuples[chosen], axis=1), axis=0))
+
+
+def _check(points: np.ndarray, cells: np.ndarray, where: str) -> None:
+    """Raise an InputError unless the mesh can carry a computation."""
+    dim = points.shape[1]
+    volume = signed_volumes(points, cells)
+    longest = np.zeros(len(cells))
+    for a in range(dim + 1):
+        for b in range(a):
+            np.maximum(longest, np.linalg.norm(points[cells[:, a]] - points[cells[:, b]], axis=1), out=longest)
+    _refuse(where, np.count_nonzero(np.abs(volume) <= FLAT * longest**dim), "cells with zero volume")
+    _refuse(where, np.count_nonzero(volume < 0), f"inverted cells among {len(cells)}: orientations are mixed")
+    _refuse(where, np.count_nonzero(occurrences(cells) > 1), "duplicate cells (the same points more than once)")
+    distance = cKDTree(points).query(points, k=2)[0][:, 1]
+    extent = np.ptp(points, axis=0).max()
+    _refuse(where, np.count_nonzero(distance <= COINCIDENT * extent), "duplicate points (in the same place)")
+    _check_manifold(points, cells, where)
+
+
+def _check_manifold(points: np.ndarray, cells: np.ndarray, where: str) -> None:
+    dim = points.shape[1]
+    faces = np.concatenate([np.delete(cells, a, axis=1) for a in range(dim + 1)])
+    _refuse(where, _distinct(faces, occurrences(faces) > 2), "facets that belong to more than two cells")
+    rim = ridges(boundary_facets(points, cells)).reshape(-1, dim - 1)
+    count = _distinct(rim, occurrences(rim) != 2)
+    kind = "points" if dim == 2 else "edges"
+    _refuse(where, count, f"boundary {kind} at which the surface meets itself (non-manifold boundary)")

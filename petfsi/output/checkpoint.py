@@ -1,0 +1,314 @@
+"""Checkpoints: all that the next step reads, whole and checked, the last few of them.
+
+A checkpoint is two files, ``NNNNNN.h5`` with the data and ``NNNNNN.json`` with the data's checksum. The second is
+moved into place last: without it, or when it does not match, there is no checkpoint.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+import petfsi
+from petfsi.errors import InputError, SolveError
+from petfsi.fields.base import Reader, Slab
+from petfsi.output import files, hdf5
+
+#: Of the layout of a checkpoint; raised when an older petfsi could not read it.
+FORMAT = 1
+_CHUNK = 1 << 24
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What the small file beside a checkpoint says."""
+
+    path: Path
+    checksum: str
+    bytes: int
+    step: int
+    time: float
+    ranks: int
+    version: str
+
+
+def write_checkpoint(
+    directory: Path,
+    step: int,
+    time: float,
+    dt: float,
+    groups: Mapping[str, Mapping[str, Slab]],
+    attributes: Mapping[str, Any],
+    comm: MPI.Comm,
+    keep: int,
+) -> Path:
+    """Write a checkpoint, remove the oldest ones beyond ``keep``, and return its file. Collective.
+
+    Parameters
+    ----------
+    directory : Path
+        Is made if need be.
+    step, time, dt : int, float, float
+        The step that was finished last, the time reached (s), the length of the next step (s).
+    groups : mapping of str to mapping of str to Slab
+        The state of every field, by the field's name.
+    attributes : mapping
+        Whatever else must come back; goes through JSON.
+    comm : MPI.Comm
+        The ranks that hold pieces.
+    keep : int
+        How many stay, this one included; at least 1.
+
+    Raises
+    ------
+    SolveError
+        On all ranks, when the disk does not take it. Nothing of it is left then, and earlier ones are untouched.
+    """
+    path = Path(directory) / f"{step:06d}.h5"
+    arrays = {f"{group}/{name}": slab for group, slabs in groups.items() for name, slab in slabs.items()}
+    about = {"step": step, "time": time, "dt": dt, "attributes": dict(attributes)}
+    try:
+        files.on_root(comm, lambda: _prepare(path.parent))
+        hdf5.write_file(files.part_of(path), arrays, about, comm)
+        files.on_root(comm, lambda: _commit(path, step, time, comm.size))
+    except OSError as error:
+        files.on_root(comm, lambda: _discard(path))
+        last = last_good(path.parent, comm)
+        why = files.reason(error, hdf5.n_bytes(arrays))
+        raise SolveError(
+            f"step {step}, t = {time:g} s: checkpoint {path} could not be written: {why}. {last}"
+        ) from error
+    files.on_root(comm, lambda: _prune(path.parent, step, keep))
+    return path
+
+
+def _prepare(directory: Path) -> None:
+    directory.mkdir(parents=True, exist_ok=True)
+    for left in directory.glob("*.part"):
+        left.unlink()
+
+
+def _commit(path: Path, step: int, time: float, ranks: int) -> None:
+    """Turn the written part into a checkpoint."""
+    part, sidecar = files.part_of(path), path.with_suffix(".json")
+    about = {
+        "file": path.name,
+        "checksum": checksum(part),
+        "bytes": part.stat().st_size,
+        "step": step,
+        "time": time,
+        "ranks": ranks,
+        "version": petfsi.__version__,
+        "format": FORMAT,
+    }
+    # the text is on the disk before either file gets its name: from here on nothing needs space
+    text = files.write_part(sidecar, json.dumps(about, indent=1) + "\n")
+    os.replace(part, path)
+    os.replace(text, sidecar)
+    files.sync_directory(path.parent)
+
+
+def _discard(path: Path) -> None:
+    """Remove what a failed write left; that must not hide why it failed."""
+    with suppress(OSError):
+        files.part_of(path).unlink(missing_ok=True)
+        files.part_of(path.with_suffix(".json")).unlink(missing_ok=True)
+        if not path.with_suffix(".json").exists():
+            path.unlink(missing_ok=True)
+
+
+def _prune(directory: Path, step: int, keep: int) -> None:
+    """Remove all but the last ``keep`` up to ``step``, which is known to be good.
+
+    Later ones belong to a future that was given up, when a damaged checkpoint made the run go back. One that is
+    evidently damaged does not count among those kept.
+    """
+    kept = 0
+    with suppress(OSError):
+        for number in reversed(_numbers(directory)):
+            whole = number <= step and isinstance(_inspect(directory, number, thorough=False), CheckpointInfo)
+            kept += whole
+            if not whole or kept > keep:
+                # in this order: a file without its small one is not taken for a checkpoint
+                (directory / f"{number:06d}.json").unlink(missing_ok=True)
+                (directory / f"{number:06d}.h5").unlink(missing_ok=True)
+
+
+def checksum(path: Path) -> str:
+    """Return the BLAKE2b digest of a file, 32 bytes in hexadecimal."""
+    digest = hashlib.blake2b(digest_size=32)
+    with open(path, "rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _numbers(directory: Path) -> list[int]:
+    """Return the steps of which there is either file, ascending."""
+    found = {p.stem for pattern in ("*.h5", "*.json") for p in directory.glob(pattern)}
+    return sorted(int(stem) for stem in found if stem.isdecimal())
+
+
+def _inspect(directory: Path, number: int, thorough: bool = True) -> CheckpointInfo | str:
+    """Return what is known of a checkpoint, or in words how it is damaged."""
+    path = directory / f"{number:06d}.h5"
+    sidecar = path.with_suffix(".json")
+    try:
+        if not sidecar.exists():
+            return f"{sidecar.name} is missing; writing it was interrupted"
+        about = json.loads(sidecar.read_text(encoding="utf-8"))
+        if about.pop("format") != FORMAT:
+            return f"petfsi {about['version']} wrote it in another format"
+        if about.pop("file") != path.name:
+            return f"{sidecar.name} speaks of another file"
+        info = CheckpointInfo(path=path, **about)
+        size = path.stat().st_size
+        if size != info.bytes:
+            return f"it has {size} bytes and should have {info.bytes}"
+        if thorough and checksum(path) != info.checksum:
+            return "its checksum does not match"
+    except FileNotFoundError:
+        return f"{path.name} is missing"
+    except OSError as error:
+        return os.strerror(error.errno or errno.EIO)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return f"{sidecar.name} is not readable"
+    return info
+
+
+def find_checkpoint(directory: Path, comm: MPI.Comm, report: Callable[[str], None]) -> CheckpointInfo | None:
+    """Return the newest checkpoint that is whole, or None. Collective.
+
+    ``report`` is called, on rank 0 alone, with a line about every newer one that is damaged.
+    """
+
+    def look() -> tuple[CheckpointInfo | None, list[str]]:
+        damaged: list[str] = []
+        for number in reversed(_numbers(Path(directory))):
+            found = _inspect(Path(directory), number)
+            if isinstance(found, CheckpointInfo):
+                return found, damaged
+            damaged.append(f"checkpoint {Path(directory) / f'{number:06d}.h5'} is damaged: {found}")
+        return None, damaged
+
+    info, damaged = files.on_root(comm, look)
+    if comm.rank == 0:
+        for line in damaged:
+            report(line)
+    return info
+
+
+def last_good(directory: Path, comm: MPI.Comm) -> str:
+    """Return a sentence that names the newest checkpoint that is whole. Collective."""
+    info = find_checkpoint(directory, comm, lambda _line: None)
+    return f"Last good checkpoint: {info.path}." if info else "There is no checkpoint."
+
+
+class CheckpointReader:
+    """An open checkpoint; what ``read_checkpoint`` gives inside ``with``.
+
+    Attributes
+    ----------
+    step, time, dt : int, float, float
+        As they were written.
+    attributes : dict
+        As they were written, through JSON.
+    """
+
+    def __init__(self, info: CheckpointInfo, comm: MPI.Comm) -> None:
+        self.comm = comm
+        self.path = info.path
+        self._file = hdf5.open_file(info.path, "r", comm)
+        about = self._file.attrs
+        self.step, self.time, self.dt = int(about["step"]), float(about["time"]), float(about["dt"])
+        self.attributes: dict[str, Any] = json.loads(about["attributes"])
+        self._shapes = {
+            f"{group}/{name}": array.shape for group, arrays in self._file.items() for name, array in arrays.items()
+        }
+        self._ends: dict[str, tuple[int, ...]] = {}
+        self._failure: OSError | None = None
+
+    def __enter__(self) -> CheckpointReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+        if error is None:
+            self._check()
+
+    def groups(self) -> list[str]:
+        """Return the names of the fields that have state here."""
+        return sorted(self._file)
+
+    def group(self, name: str) -> Reader:
+        """Return the reader of one field's state.
+
+        Each rank reads on its own. A piece that lies outside the stored array comes back as zeros there, and the
+        end of the ``with`` block, which is collective, raises the error on all ranks: a rank that raised alone
+        would leave the others waiting in the next collective call.
+        """
+        if name not in self._file:
+            raise InputError(f"checkpoint {self.path} holds no state of '{name}', only of {', '.join(self.groups())}")
+
+        def read(array: str, start: tuple[int, ...], count: tuple[int, ...]) -> np.ndarray:
+            return self._read(f"{name}/{array}", tuple(start), tuple(count))
+
+        return read
+
+    def _read(self, name: str, start: tuple[int, ...], count: tuple[int, ...]) -> np.ndarray:
+        if name not in self._shapes:
+            raise InputError(f"checkpoint {self.path} has no array '{name}', which the scene asks for")
+        dataset = self._file[name]
+        if len(dataset.shape) != len(count):
+            raise InputError(
+                f"checkpoint {self.path}: '{name}' has shape {dataset.shape}; the scene wants {len(count)} axes"
+            )
+        end = tuple(s + c for s, c in zip(start, count, strict=True))
+        inside = all(e <= n for e, n in zip(end, dataset.shape, strict=True))
+        self._ends[name] = tuple(map(max, end, self._ends.get(name, end)))
+        data = np.zeros(count, dataset.dtype)
+        if inside and data.size:
+            try:
+                hdf5.read_piece(dataset.id, start, data)
+            except OSError as error:
+                self._failure = OSError(error.errno or errno.EIO, str(error), str(self.path))
+        return data
+
+    def _check(self) -> None:
+        """Raise on all ranks if the pieces of all ranks do not make up the stored arrays. Collective."""
+        everyone = self.comm.allgather((self._ends, self._failure))
+        for _ends, failure in everyone:
+            if failure is not None:
+                raise InputError(f"checkpoint {self.path} cannot be read: {files.reason(failure)}") from failure
+        for name, shape in sorted(self._shapes.items()):
+            ends = [ends[name] for ends, _failure in everyone if name in ends]
+            wanted = tuple(max(along) for along in zip(*ends, strict=True))
+            if ends and wanted != shape:
+                raise InputError(f"checkpoint {self.path}: '{name}' has shape {shape}; the scene wants {wanted}")
+
+
+def read_checkpoint(info: CheckpointInfo, comm: MPI.Comm) -> CheckpointReader:
+    """Open a checkpoint on all ranks, as a context manager whose end checks what was read. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, when an array is missing or its shape is not what the scene wants.
+    """
+    try:
+        return CheckpointReader(info, comm)
+    except (OSError, KeyError) as error:
+        raise InputError(f"checkpoint {info.path} cannot be read: {error}") from error

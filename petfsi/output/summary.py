@@ -1,0 +1,98 @@
+"""``summary.json``: what a run was and how it ended, in one small file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from mpi4py import MPI
+
+from petfsi.errors import InputError, SolveError
+from petfsi.output import files
+from petfsi.output.hdf5 import plain
+
+
+@dataclass
+class Summary:
+    """The keys of ``summary.json``.
+
+    Attributes
+    ----------
+    status : str
+        ``done``, ``stopped`` (resumable) or ``failed``.
+    steps : int
+        Steps finished since time zero, over all resumed parts.
+    time : float
+        Time reached, s.
+    ranks : int
+        How many processes ran it.
+    unknowns : dict
+        By field.
+    wall_s : float
+        Wall time, s.
+    phases : dict
+        Wall time of predict, couple, assemble, solve, accept and observe, s.
+    iterations : dict
+        ``mean`` and ``max`` over the steps.
+    assemblies : dict
+        How often each field's block and each coupling's blocks were assembled.
+    conservation : dict
+        Volume error, energies, ...
+    probes : dict
+        The last value of each.
+    skipped : list of str
+        What this scene had no need of, and why.
+    versions : dict
+        Of petfsi and the libraries that decide its numbers.
+    """
+
+    status: Literal["done", "stopped", "failed"]
+    steps: int
+    time: float
+    ranks: int = 1
+    unknowns: dict[str, int] = field(default_factory=dict)
+    wall_s: float = 0.0
+    phases: dict[str, float] = field(default_factory=dict)
+    iterations: dict[str, float] = field(default_factory=dict)
+    assemblies: dict[str, int] = field(default_factory=dict)
+    conservation: dict[str, float] = field(default_factory=dict)
+    probes: dict[str, Any] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+    versions: dict[str, str] = field(default_factory=dict)
+
+
+def write_summary(path: Path, summary: Summary, comm: MPI.Comm) -> None:
+    """Write the summary, replacing an earlier one in one piece. Collective."""
+
+    def write() -> None:
+        # through JSON once to be rid of NumPy's types, then of the numbers that JSON has no name for
+        content = json.loads(json.dumps(asdict(summary), default=plain))
+        files.replace_text(Path(path), json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+    try:
+        files.on_root(comm, write)
+    except OSError as error:
+        raise SolveError(f"{path} could not be written: {files.reason(error)}") from error
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Return a summary as a dictionary. Not collective."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {os.strerror(error.errno or 0)}") from error
+    except ValueError as error:
+        raise InputError(f"{path} is not a summary: {error}") from error
+
+
+def _finite(value: Any) -> Any:
+    """Replace NaN and infinities by null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,178 @@
+"""The one place that knows PETSc's versions, ranks and the life of its options."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from petfsi.errors import InputError
+
+IntType = PETSc.IntType
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a vector lies on the ranks: this rank holds entries ``start`` to ``start + n_local`` of ``n_global``."""
+
+    n_local: int
+    start: int
+    n_global: int
+
+    @classmethod
+    def of(cls, comm: MPI.Comm, n_local: int) -> Layout:
+        """Return the layout in which this rank holds ``n_local`` entries. Collective."""
+        end = comm.scan(n_local)
+        return cls(n_local, end - n_local, comm.allreduce(n_local))
+
+    @property
+    def end(self) -> int:
+        """One past this rank's last entry."""
+        return self.start + self.n_local
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """The pair that PETSc's constructors take."""
+        return self.n_local, self.n_global
+
+
+def new_block(comm: MPI.Comm, rows: Layout, cols: Layout, block_size: int = 1) -> PETSc.Mat:
+    """Return an AIJ matrix without a pattern yet; ``set_csr`` gives it one. Collective."""
+    mat = PETSc.Mat().create(comm)
+    mat.setSizes((rows.sizes, cols.sizes))
+    mat.setType(PETSc.Mat.Type.AIJ)
+    if block_size > 1:
+        mat.setBlockSize(block_size)
+    mat.setUp()
+    return mat
+
+
+def set_csr(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray, new_pattern: bool) -> None:
+    """Fill a matrix with this rank's rows. Collective.
+
+    The matrix stays the same object, so a nest that holds it stays valid when its pattern changes.
+
+    Parameters
+    ----------
+    mat : PETSc.Mat
+        The matrix, from ``new_block``.
+    indptr, indices, values : ndarray
+        Local rows in compressed form, global column numbers of ``IntType``, sorted within each row.
+    new_pattern : bool
+        Whether any rank's pattern differs from that of the last call; the same on all ranks.
+    """
+    if new_pattern:
+        mat.setPreallocationCSR((indptr, indices, values))
+    else:
+        mat.setValuesCSR(indptr, indices, values)
+        mat.assemble()
+
+
+def gather_triplets(
+    comm: MPI.Comm, rows: Layout, i: np.ndarray, j: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Send matrix entries to the ranks that own their rows and return this rank's as CSR. Collective.
+
+    Duplicates are added in an order that depends on nothing but the ranks' numbers, so that a run repeats bit
+    for bit, which PETSc's own stash does not promise.
+
+    Returns
+    -------
+    indptr, indices, values : ndarray
+        Local rows; columns global, sorted, unique.
+    """
+    if comm.size > 1:
+        starts = np.array(comm.allgather(rows.start))
+        # of ranks that begin at the same row only the last one owns it
+        owner = np.searchsorted(starts, i, side="right") - 1
+        order = np.argsort(owner, kind="stable")
+        counts = np.bincount(owner, minlength=comm.size)
+        received = np.empty_like(counts)
+        comm.Alltoall(counts, received)
+        parts = []
+        for part, kind in ((i, np.int64), (j, np.int64), (values, np.float64)):
+            send = np.ascontiguousarray(part[order], dtype=kind)
+            recv = np.empty(received.sum(), dtype=kind)
+            comm.Alltoallv([send, counts], [recv, received])
+            parts.append(recv)
+        i, j, values = parts
+    local = np.asarray(i, dtype=np.int64) - rows.start
+    order = np.lexsort((j, local))
+    local, j, values = local[order], np.asarray(j)[order], np.asarray(values, dtype=float)[order]
+    if len(local):
+        first = np.flatnonzero(np.concatenate(([True], (np.diff(local) != 0) | (np.diff(j) != 0))))
+        values = np.add.reduceat(values, first)
+        local, j = local[first], j[first]
+    indptr = np.zeros(rows.n_local + 1, dtype=IntType)
+    np.cumsum(np.bincount(local, minlength=rows.n_local), out=indptr[1:])
+    return indptr, j.astype(IntType), values
+
+
+# ---- options ------------------------------------------------------------------------------------------------
+
+
+def _library() -> ctypes.CDLL:
+    """Return the libpetsc that this process runs; loading a second one by name would crash."""
+    maps = Path("/proc/self/maps").read_text().split()
+    return ctypes.CDLL(next(word for word in maps if "/libpetsc" in word))
+
+
+def insert_options_file(path: Path) -> None:
+    """Put the options of a file into PETSc's database; later ones win. Collective.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or PETSc does not understand it.
+    """
+    if not path.is_file():
+        raise InputError(f"-options_file {path}: no such file; petfsi's own are listed by 'petfsi info'")
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        words = line.split("#")[0].split()
+        if words and not words[0].startswith("-"):
+            raise InputError(f"{path}, line {number}: '{line.strip()}' is no option; wanted '-name [value]' or '# ...'")
+    try:
+        PETSc.Options().insertString(f"-options_file {path}")
+    except PETSc.Error as error:
+        raise InputError(f"-options_file {path}: PETSc cannot read it ({error})") from None
+
+
+def insert_options(args: list[str]) -> None:
+    """Put command-line words into PETSc's database, over what files said. Collective."""
+    if args:
+        PETSc.Options().insertString(" ".join(f'"{word}"' if " " in word else word for word in args))
+
+
+def unread_options(prefix: str) -> list[str]:
+    """Return the names that start with a prefix and that no solver has asked for."""
+    used = ctypes.c_int()
+    library, unread = _library(), []
+    for name in PETSc.Options().getAll():
+        if name.startswith(prefix):
+            library.PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
+            if not used.value:
+                unread.append(name)
+    return sorted(unread)
+
+
+def reason_name(ksp: PETSc.KSP) -> str:
+    """Return PETSc's name of the reason why a solver stopped."""
+    reason = ksp.getConvergedReason()
+    names = [n for n, value in vars(type(ksp).ConvergedReason).items() if value == reason and n.isupper()]
+    failures = [n for n in names if n.startswith(("DIVERGED", "CONVERGED"))]
+    return (failures or names or [str(reason)])[0]
+
+
+def null_space(comm: MPI.Comm, like: PETSc.Vec, vectors: list[np.ndarray]) -> PETSc.NullSpace:
+    """Return the null space spanned by vectors without common support, given by their local parts. Collective."""
+    basis = []
+    for values in vectors:
+        vec = like.duplicate()
+        vec.array = values
+        vec.normalize()
+        basis.append(vec)
+    return PETSc.NullSpace().create(constant=False, vectors=basis, comm=comm)

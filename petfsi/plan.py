@@ -1,0 +1,243 @@
+"""What a scene would solve, and what this installation can solve it with."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+
+from petfsi import __version__
+from petfsi.errors import InputError
+from petfsi.scene.checks import check_inside_grid
+from petfsi.scene.schema import Scene
+
+#: The options file in force when none is named.
+DEFAULT_OPTIONS = "monolithic.opts"
+#: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.
+PROGRAM_BYTES = 250e6
+#: Vectors of the length of all unknowns: those of 30 flexible GMRES iterations, and a few more.
+KRYLOV_VECTORS = 65
+#: A preconditioner holds about as much as this many copies of its matrix.
+PRECONDITIONER = 3.0
+#: Bytes of a matrix entry: a value and a column number.
+ENTRY_BYTES = 12
+
+PACKAGES = (
+    "mumps superlu superlu_dist suitesparse mkl_pardiso strumpack hypre ml scalapack metis parmetis ptscotch "
+    "slepc cuda hip kokkos"
+).split()
+
+
+def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
+    """Return what a run of the scene would do, for people. Not collective; reads the scene's meshes.
+
+    Parameters
+    ----------
+    scene : Scene
+        A valid scene.
+    petsc_options : sequence of str
+        PETSc options as on the command line.
+
+    Raises
+    ------
+    InputError
+        With every mistake in its mesh files.
+    """
+    nodes, cells = _solid_sizes(scene)
+    lines = [scene.title or "untitled", ""]
+    lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, nodes, cells)]
+    lines += [f"{'options:':<13}{_options(scene, petsc_options)}", "", "skipped:"]
+    return "\n".join([*lines, *(f"  {line}" for line in skipped(scene))])
+
+
+def skipped(scene: Scene) -> list[str]:
+    """Return what is neither allocated nor assembled for this scene, and why."""
+    out = []
+    if scene.fluid is None:
+        out.append("fluid, nest and coupling: the scene has no [fluid]; the solid's block alone is solved")
+    if not scene.solids:
+        out.append("solid, nest and coupling: the scene has no [solids]; the pressure's block alone is solved")
+    if scene.fluid is not None:
+        out.append("viscous terms: viscosity is 0")
+        if scene.fluid.smoke is None:
+            out.append("smoke: there is no [fluid.smoke]")
+        if not scene.obstacles:
+            out.append("obstacles: there are none")
+        if not scene.solids:
+            out.append("geometry after the first step: sides and obstacles do not move, the matrix stays")
+    if scene.gravity is None:
+        out.append("gravity: not given")
+    if scene.solids and all(s.damping.mass == 0 and s.damping.stiffness == 0 for s in scene.solids.values()):
+        out.append("damping: its coefficients are 0")
+    if scene.output.every is None:
+        out.append("fields.xdmf: there is no output.every")
+    return out
+
+
+def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> list[tuple[str, str]]:
+    rows = []
+    unknowns = 0
+    if scene.fluid is not None:
+        n = math.prod(scene.fluid.cells)
+        unknowns += n
+        rows.append(("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, scene.fluid.cells))}"))
+    if nodes:
+        n = scene.dim * sum(nodes.values())
+        unknowns += n
+        bodies = "; ".join(f"{name} {nodes[name]:,} nodes, {cells[name]:,} cells" for name in nodes)
+        rows.append(("solid", f"{n:,} unknowns ({bodies})"))
+    rows.append(("in all", f"{unknowns:,} unknowns"))
+    memory = _state_bytes(scene, sum(nodes.values()), sum(cells.values()))
+    more = "; much more where a large 3D solid is factorised" if nodes and scene.dim == 3 else ""
+    rows.append(("memory", f"about {_bytes(memory)}, and {_bytes(PROGRAM_BYTES)} a rank for the program{more}"))
+    time = scene.time
+    rows.append(("steps", f"{time.steps:,} of {time.dt:g} s to {time.end:g} s, {time.integrator}"))
+    if scene.output.every is not None:
+        times = min(_count(time.end, scene.output.every), time.steps) + 1
+        size = times * _output_bytes(scene, sum(nodes.values()))
+        rows.append(("outputs", f"{times:,}, every {scene.output.every:g} s, about {_bytes(size)} in all"))
+    every = scene.checkpoint.every
+    written = 1 if every is None else min(_count(time.end, every), time.steps)
+    rows.append(("checkpoints", f"{written:,}, of which the last {min(written, scene.checkpoint.keep)} stay"))
+    if scene.probes:
+        rows.append(("probes", ", ".join(f"{name} ({p.quantity} of {p.of})" for name, p in scene.probes.items())))
+    if scene.fluid is not None and scene.solids:
+        rows.append(("coupling", scene.coupling.transfer))
+    return rows
+
+
+def _count(end: float, every: float) -> int:
+    return max(1, math.ceil(end / every - 1e-9))
+
+
+# ---- sizes --------------------------------------------------------------------------------------------------
+
+
+def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
+    """Return nodes and cells of each solid; meshes from files are read and judged, obstacles' surfaces too."""
+    nodes, cells, errors = {}, {}, []
+    for name, solid in scene.solids.items():
+        box = solid.shape.box
+        if box is not None and box.cells is not None and solid.shape.cavity is None:
+            nodes[name] = math.prod(n + 1 for n in box.cells)
+            cells[name] = math.prod(box.cells) * math.factorial(scene.dim)
+            continue
+        from petfsi.geometry.meshes import build_mesh
+
+        try:
+            points, simplices = build_mesh(solid, scene.dim, f"solids.{name}", scene.directory)
+            check_inside_grid(scene, f"solids.{name}.shape", points)
+            nodes[name], cells[name] = len(points), len(simplices)
+        except InputError as error:
+            errors.append(str(error))
+    for name, obstacle in scene.obstacles.items():
+        if obstacle.shape.mesh is not None:
+            from petfsi.geometry.meshes import read_surface
+
+            try:
+                read_surface(obstacle.shape, scene.dim, f"obstacles.{name}.shape", scene.directory)
+            except InputError as error:
+                errors.append(str(error))
+    if errors:
+        raise InputError("\n".join(errors))
+    return nodes, cells
+
+
+def _state_bytes(scene: Scene, nodes: int, cells: int) -> float:
+    """Return an estimate of what all ranks hold together: state, matrices, preconditioner, Krylov vectors."""
+    dim = scene.dim
+    total = 0.0
+    if scene.fluid is not None:
+        arrays = 8 * (4 * dim + 4) + dim + 5 + (16 if scene.fluid.smoke is not None else 0)
+        matrix = ENTRY_BYTES * (2 * dim + 1) * (1 + PRECONDITIONER)
+        total += math.prod(scene.fluid.cells) * (arrays + matrix + 8 * KRYLOV_VECTORS)
+    neighbours = 7 if dim == 2 else 15
+    matrix = ENTRY_BYTES * dim**2 * neighbours * (1 + PRECONDITIONER)
+    total += nodes * (matrix + 8 * dim * KRYLOV_VECTORS)
+    # an element keeps where its matrix goes, the matrix while it is assembled, and its gradients
+    return total + cells * (16 * (dim * (dim + 1)) ** 2 + 8 * dim * (dim + 1))
+
+
+def _output_bytes(scene: Scene, nodes: int) -> float:
+    per_cell = 8 * (scene.dim + 2 + (scene.fluid is not None and scene.fluid.smoke is not None))
+    cells = math.prod(scene.fluid.cells) if scene.fluid is not None else 0
+    return float(cells * per_cell + nodes * 16 * scene.dim)
+
+
+def _bytes(count: float) -> str:
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def _options(scene: Scene, petsc_options: Sequence[str]) -> str:
+    files = [value for name, value in zip(petsc_options, petsc_options[1:], strict=False) if name == "-options_file"]
+    chosen = ", ".join(files) or f"{DEFAULT_OPTIONS} (the default)"
+    words = " ".join(petsc_options)
+    for name in files:
+        words = words.replace(f"-options_file {name}", "")
+    coupled = "" if scene.fluid is not None and scene.solids else "; of it, what the single field reads"
+    return chosen + coupled + (f"; over it {' '.join(words.split())}" if words.split() else "")
+
+
+# ---- the installation ---------------------------------------------------------------------------------------
+
+
+def describe_info() -> str:
+    """Return versions, PETSc's packages, the solvers' prefixes and the shipped options files. Starts PETSc."""
+    return "\n".join([*_versions(), "", *_prefixes(), "", *_options_files()])
+
+
+def _versions() -> list[str]:
+    import h5py
+    import mpi4py
+    import numba
+    import petsc4py
+    from mpi4py import MPI
+    from petsc4py import PETSc
+
+    library = MPI.Get_library_version().split(",")[0].split("\n")[0].strip()
+    scalar = np.dtype(PETSc.ScalarType).name
+    packages = [name for name in PACKAGES if PETSc.Sys.hasExternalPackage(name)]
+    rows = [
+        ("petfsi", __version__),
+        ("PETSc", f"{'.'.join(map(str, PETSc.Sys.getVersion()))} ({scalar}, {np.dtype(PETSc.IntType).name} indices)"),
+        ("petsc4py", petsc4py.__version__),
+        ("mpi4py", f"{mpi4py.__version__} ({library})"),
+        ("h5py", f"{h5py.__version__} ({'parallel' if h5py.get_config().mpi else 'serial: no parallel output'})"),
+        ("numpy", np.__version__),
+        ("numba", numba.__version__),
+        ("PETSc has", ", ".join(packages) or "no external packages"),
+    ]
+    return [f"{name + ':':<12}{text}" for name, text in rows]
+
+
+def _prefixes() -> list[str]:
+    from petfsi.solve import PREFIX, field_prefix
+
+    rows = [
+        (PREFIX, "the coupled system of a step: solid velocities and fluid pressures"),
+        (field_prefix("solid"), "the solid's block in it, or a scene without fluid"),
+        (field_prefix("pressure"), "the pressure's block in it, or a scene without solids"),
+    ]
+    return ["solvers:", *(f"  -{prefix:<27}{text}" for prefix, text in rows)]
+
+
+def _options_files() -> list[str]:
+    from petfsi.solve import shipped_options
+
+    files = shipped_options()
+    return ["options files (give the name to -options_file):", *(f"  {p.name:<27}{_first_sentence(p)}" for p in files)]
+
+
+def _first_sentence(path: Path) -> str:
+    """Return how an options file's opening comment begins."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comment = " ".join(line.lstrip("# ").strip() for line in takewhile(lambda line: line.startswith("#"), lines))
+    return re.split(r"(?<=\.)\s+(?=[A-Z])", comment)[0]

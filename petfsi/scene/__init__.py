@@ -1,0 +1,1 @@
+"""Scenes: what they may say, and how they are read."""

@@ -1,0 +1,64 @@
+"""A scene as TOML text."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from typing import Any
+
+from petfsi.scene.schema import Scene
+
+
+def dump_scene(scene: Scene) -> str:
+    """Return the scene with every default filled in; read again, from any folder, it is an equal scene."""
+    data = scene.model_dump(exclude_none=True)
+    if scene.fluid is not None and scene.dim == 2:
+        for side in ("back", "front"):
+            del data["fluid"]["sides"][side]
+    for item in (*data["solids"].values(), *data["obstacles"].values()):
+        if "mesh" in item["shape"]:
+            item["shape"]["mesh"] = os.path.abspath(scene.directory / item["shape"]["mesh"])
+    _drop_idle(data)
+    return "\n".join(_table(data, ())).lstrip("\n") + "\n"
+
+
+def _drop_idle(data: Any) -> None:
+    """Leave out the mesh scale of shapes that are no mesh."""
+    if isinstance(data, dict) and "scale" in data and "mesh" not in data:
+        del data["scale"]
+    for item in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
+        _drop_idle(item)
+
+
+def _table(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
+    """Return the lines of a table: its plain settings first, as TOML wants it, then the tables inside."""
+    lines = [f"{_key(name)} = {_value(value)}" for name, value in table.items() if not isinstance(value, dict)]
+    inner = [(name, value) for name, value in table.items() if isinstance(value, dict)]
+    if path and lines:
+        lines = ["", f"[{'.'.join(map(_key, path))}]", *lines]
+    for name, value in inner:
+        lines += _table(value, (*path, name))
+    return lines
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _text(name)
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _value(value: Any) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return _text(value)
+        case list():
+            return "[" + ", ".join(map(_value, value)) + "]"
+        case dict():
+            items = ", ".join(f"{_key(name)} = {_value(item)}" for name, item in value.items())
+            return f"{{ {items} }}" if items else "{}"
+    return repr(value)

@@ -1,0 +1,235 @@
+"""What is wrong with a scene, in the words of a user: the key, its value, and what is allowed."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from petfsi.scene.schema import Scene
+
+#: No value stands at the key.
+ABSENT = object()
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake.
+
+    Attributes
+    ----------
+    key : str
+        Dotted path, as ``--set`` takes it.
+    value : object
+        What stands there.
+    allowed : str
+        What may stand there.
+    uses : tuple of str
+        Other keys the verdict rests on; while one of them is wrong itself, the verdict is withheld.
+    """
+
+    key: str
+    value: Any
+    allowed: str
+    uses: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        value = "" if self.value is ABSENT else f" = {shorten(self.value)}"
+        return f"{self.key}{value}: {self.allowed}"
+
+    def follows_from(self, wrong: Iterable[str]) -> bool:
+        """Whether one of the keys it rests on, or one inside or around them, is known to be wrong."""
+        return any(_overlap(mine, other) for mine in (self.key, *self.uses) for other in wrong)
+
+
+def _overlap(a: str, b: str) -> bool:
+    short, long = sorted((a.split("."), b.split(".")), key=len)
+    return long[: len(short)] == short
+
+
+def shorten(value: Any) -> str:
+    """Return a value on one line of bounded length."""
+    text = f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
+    text = " ".join(text.split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+# ---- from pydantic ------------------------------------------------------------------------------------------
+
+
+def describe(entry: Mapping[str, Any]) -> Problem:
+    """Return pydantic's finding as a problem."""
+    loc = [part for part in entry["loc"] if not str(part).startswith(("<", "["))]
+    key = ".".join(str(part) for part in loc)
+    field = _field(loc)
+    value = ABSENT if entry["type"] == "missing" or entry["loc"][-1] == "[key]" else entry["input"]
+    if entry["type"] == "extra_forbidden":
+        return Problem(key, value, _unknown(loc))
+    allowed = _allowed(entry)
+    unit = f" ({field.description})" if field is not None and field.description else ""
+    return Problem(key, value, allowed + unit)
+
+
+def _allowed(entry: Mapping[str, Any]) -> str:
+    context = entry.get("ctx", {})
+    match entry["type"]:
+        case "missing":
+            return "is missing"
+        case "float_type":
+            return "must be a number"
+        case "finite_number":
+            return "must be a finite number"
+        case "int_type":
+            return "must be a whole number"
+        case "bool_type":
+            return "must be true or false"
+        case "string_type":
+            return "must be a text in quotes"
+        case "list_type":
+            return "must be a list [..., ...]"
+        case "model_type" | "dict_type":
+            return "must be a table"
+        case "literal_error":
+            return f"must be {context['expected']}"
+        case "greater_than":
+            return f"must be greater than {context['gt']:g}"
+        case "greater_than_equal":
+            return f"must be {context['ge']:g} or more"
+        case "less_than":
+            return f"must be less than {context['lt']:g}"
+        case "less_than_equal":
+            return f"must be {context['le']:g} or less"
+        case "too_short":
+            return "must not be empty"
+    return entry["msg"]
+
+
+def _unknown(loc: list[Any]) -> str:
+    """Say that there is no such setting, and which one may be meant: beside it, or else in another table."""
+    name, table = str(loc[-1]), _model(loc[:-1])
+    fields = table.model_fields if table is not None else {}
+    near = difflib.get_close_matches(name, fields, 1)
+    if near:
+        unit = fields[near[0]].description
+        return f"no setting '{name}'; did you mean '{near[0]}'" + (f" ({unit})?" if unit else "?")
+    elsewhere = [path for path in _every_setting(Scene) if path[-1] == name]
+    if elsewhere and len(elsewhere[0]) == 1:
+        return f"no setting '{name}' here; it stands at the top of the scene, before any [table]"
+    if elsewhere:
+        return f"no setting '{name}' here; did you mean '{'.'.join(elsewhere[0])}'?"
+    return f"no setting '{name}'; known here are {', '.join(fields)}"
+
+
+def _every_setting(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for name, field in model.model_fields.items():
+        yield (*path, name)
+        for part in _parts(field.annotation):
+            named = get_origin(part) is dict
+            for inner in _parts(get_args(part)[1]) if named else [part]:
+                if _is_model(inner):
+                    yield from _every_setting(inner, (*path, name, "<name>") if named else (*path, name))
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _parts(annotation: Any) -> list[Any]:
+    """Return the members of a union, the annotation itself otherwise, bare of ``Annotated``."""
+    if get_origin(annotation) is Annotated:
+        return _parts(get_args(annotation)[0])
+    if get_origin(annotation) in (dict, list) or not get_args(annotation):
+        return [annotation]
+    return [inner for part in get_args(annotation) for inner in _parts(part)]
+
+
+def _walk(loc: list[Any]) -> tuple[list[Any], FieldInfo | None]:
+    """Follow a path through the models: what may stand there, and the last field passed."""
+    here: list[Any] = [Scene]
+    field: FieldInfo | None = None
+    for part in loc:
+        following: list[Any] = []
+        for kind in here:
+            if _is_model(kind) and part in kind.model_fields:
+                field = kind.model_fields[part]
+                following += _parts(field.annotation)
+            elif get_origin(kind) in (dict, list):
+                following += _parts(get_args(kind)[-1])
+        here = following
+    return here, field
+
+
+def _field(loc: list[Any]) -> FieldInfo | None:
+    return _walk(loc)[1]
+
+
+def _model(loc: list[Any]) -> type[BaseModel] | None:
+    return next((kind for kind in _walk(loc)[0] if _is_model(kind)), None)
+
+
+# ---- going on -----------------------------------------------------------------------------------------------
+
+#: Harmless values for settings that are required: what stands there is wrong, the rest can still be judged.
+_STAND_IN: dict[str, Any] = {
+    "time": {"end": 1.0, "dt": 1.0},
+    "dt": 1.0,
+    "density": 1.0,
+    "young": 1.0,
+    "poisson": 0.0,
+    "radius": 1.0,
+    "speed": 0.0,
+    "shape": {},
+    "of": "fluid",
+    "quantity": "velocity",
+    "where": "all",
+    "fix": ["x"],
+}
+_VECTORS = ("origin", "size", "cells", "centre", "start", "point", "normal", "at")
+
+
+def mend(data: dict[str, Any], error: ValidationError, context: dict[str, Any]) -> Scene | None:
+    """Return the scene with harmless values where pydantic found mistakes, or None where that does not help.
+
+    It serves to look for further mistakes, so that a user sees all of them at once, and is never run.
+    """
+    data = copy.deepcopy(data)
+    dim = 3 if data.get("dim") == 3 else 2
+    for entry in error.errors(include_url=False):
+        loc = [part for part in entry["loc"] if not str(part).startswith(("<", "["))]
+        _replace(data, loc, dim, required=entry["type"] != "extra_forbidden")
+    try:
+        return Scene.model_validate(data, context=context)
+    except ValidationError:
+        return None
+
+
+def _replace(data: Any, loc: list[Any], dim: int, required: bool) -> None:
+    """Put a harmless value at the path, or nothing where nothing is needed."""
+    for part in loc[:-1]:
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            return  # an earlier replacement has taken it along
+    name = loc[-1]
+    if isinstance(data, list):
+        data[name] = "x" if loc[-2] == "fix" else 1
+    elif isinstance(data, dict):
+        value = _stand_in(loc, dim) if required else None
+        if value is None:
+            data.pop(name, None)
+        else:
+            data[name] = value
+
+
+def _stand_in(loc: list[Any], dim: int) -> Any:
+    name = loc[-1]
+    if name == "dim":
+        return dim
+    if name == "end":  # of the time, or of a cylinder
+        return 1.0 if loc[0] == "time" else [1.0] * dim
+    return [1] * dim if name in _VECTORS else copy.deepcopy(_STAND_IN.get(name))

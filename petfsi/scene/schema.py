@@ -1,0 +1,329 @@
+"""What a scene may say: one frozen model per table, SI units, unknown keys refused.
+
+The models judge one key at a time; what needs several keys at once stands in ``checks.py``. A field's description
+is its unit or a few words on what is meant, and ends up in error messages.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PrivateAttr,
+    Strict,
+    Tag,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import PydanticCustomError
+
+
+def _number_or_text(value: Any) -> Any:
+    """Refuse what is neither a finite number nor a text, in one message rather than one per type."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise PydanticCustomError("number_or_text", "must be a number or an expression in quotes")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise PydanticCustomError("number_or_text", "must be a finite number")
+    return value
+
+
+#: TOML has types, so a text is no number, and neither is true.
+Real = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
+Vector = list[Real]
+Cells = list[Annotated[Whole, Field(ge=1)]]
+#: A number, or an expression of x, y, z, t and pi (see ``expressions.py``).
+Number = Annotated[float | str, BeforeValidator(_number_or_text)]
+Axis = Literal["x", "y", "z"]
+Place = Literal["left", "right", "bottom", "top", "back", "front", "all"]
+
+
+class Table(BaseModel):
+    """A table of the scene."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Time(Table):
+    """When the run ends and how it steps."""
+
+    end: Annotated[Real, Field(gt=0, description="s")]
+    dt: Annotated[Real, Field(gt=0, description="s")]
+    integrator: Literal["newmark"] = "newmark"
+
+    @property
+    def steps(self) -> int:
+        """How many steps of ``dt`` reach ``end``; round-off in their ratio adds none."""
+        ratio = self.end / self.dt
+        nearest = round(ratio)
+        return max(1, nearest if abs(ratio - nearest) < 1e-9 * ratio else math.ceil(ratio))
+
+
+# ---- shapes -------------------------------------------------------------------------------------------------
+
+
+class Box(Table):
+    """An axis-parallel box; with ``cells`` it can be meshed."""
+
+    origin: Annotated[Vector, Field(description="m")]
+    size: Annotated[Vector, Field(description="m")]
+    cells: Cells | None = None
+
+
+class Ball(Table):
+    """A disk (2D) or ball (3D)."""
+
+    centre: Annotated[Vector, Field(description="m")]
+    radius: Annotated[Real, Field(gt=0, description="m")]
+
+
+class Cylinder(Table):
+    """A finite round cylinder between two points (3D only)."""
+
+    start: Annotated[Vector, Field(description="m")]
+    end: Annotated[Vector, Field(description="m")]
+    radius: Annotated[Real, Field(gt=0, description="m")]
+
+
+class Halfspace(Table):
+    """All points behind a plane: (x - point) . normal <= 0."""
+
+    point: Annotated[Vector, Field(description="m")]
+    normal: Vector
+
+
+class Shape(Table):
+    """Exactly one of the shapes; ``mesh`` is a file that meshio reads, relative to the scene."""
+
+    box: Box | None = None
+    ball: Ball | None = None
+    cylinder: Cylinder | None = None
+    halfspace: Halfspace | None = None
+    mesh: Annotated[str | None, Field(description="a file that meshio reads")] = None
+    scale: Annotated[Real, Field(gt=0, description="factor on a mesh file's coordinates")] = 1.0
+    translate: Annotated[Vector | None, Field(description="m, applied to a mesh file after scaling")] = None
+    cavity: Annotated[Box | None, Field(description="cells of a meshed box with their centre in it are left out")] = (
+        None
+    )
+
+    @field_validator("mesh")
+    @classmethod
+    def _absolute(cls, mesh: str | None, info: ValidationInfo) -> str | None:
+        """Resolve a mesh path against the scene's directory, so that the run directory's copy still finds it."""
+        if mesh and info.context:
+            return os.path.abspath(Path(info.context["directory"], Path(mesh).expanduser()))
+        return mesh
+
+    @property
+    def kinds(self) -> list[str]:
+        """Which shapes are given; a valid shape names one."""
+        return [kind for kind in ("box", "ball", "cylinder", "halfspace", "mesh") if getattr(self, kind) is not None]
+
+
+# ---- fluid --------------------------------------------------------------------------------------------------
+
+
+class Inflow(Table):
+    """A jet through (part of) a side."""
+
+    speed: Annotated[Number, Field(description="m/s into the domain; may depend on x, y, z, t")]
+    region: Annotated[Shape | None, Field(description="the part of the side in this shape, or all of it")] = None
+    ramp: Annotated[Real, Field(ge=0, description="s over which the speed grows smoothly from zero")] = 0.0
+    smoke: Annotated[Real, Field(ge=0, description="smoke carried in")] = 0.0
+    rest: Annotated[Literal["slip", "open"], Field(description="what the remainder of the side is")] = "slip"
+
+
+class InflowSide(Table):
+    """The table form of a side."""
+
+    inflow: Inflow
+
+
+def _side_form(value: Any) -> str:
+    """Tell the two forms of a side apart by their type, so that errors speak of one form only."""
+    return "<table>" if isinstance(value, dict | InflowSide) else "<name>"
+
+
+Side = Annotated[
+    Annotated[Literal["slip", "open", "periodic"], Tag("<name>")] | Annotated[InflowSide, Tag("<table>")],
+    Discriminator(_side_form),
+    Field(description="or { inflow = { speed = ... } }"),
+]
+
+
+class Sides(Table):
+    """The sides of the grid; left/right bound x, bottom/top y, back/front z (3D only)."""
+
+    left: Side = "slip"
+    right: Side = "slip"
+    bottom: Side = "slip"
+    top: Side = "slip"
+    back: Side = "slip"
+    front: Side = "slip"
+
+
+class Smoke(Table):
+    """A scalar carried along with the fluid."""
+
+    initial: Annotated[Number, Field(description="may depend on x, y, z")] = 0.0
+    buoyancy: Annotated[Real, Field(description="acceleration against gravity per unit of smoke, over gravity")] = 0.0
+
+
+class FluidInitial(Table):
+    """The fluid at time zero."""
+
+    velocity: Annotated[list[Number] | None, Field(description="m/s; may depend on x, y, z")] = None
+
+
+class Fluid(Table):
+    """An incompressible fluid on a regular staggered grid."""
+
+    kind: Literal["mac"] = "mac"
+    density: Annotated[Real, Field(gt=0, description="kg/m^3")]
+    viscosity: Annotated[Real, Field(description="Pa s")] = 0.0
+    origin: Annotated[Vector, Field(description="m")]
+    size: Annotated[Vector, Field(description="m")]
+    cells: Cells
+    sides: Sides = Sides()
+    smoke: Smoke | None = None
+    initial: FluidInitial = FluidInitial()
+
+    @field_validator("viscosity")
+    @classmethod
+    def _inviscid(cls, viscosity: float) -> float:
+        if viscosity != 0:
+            raise PydanticCustomError("inviscid", "must be 0: this version solves inviscid fluids")
+        return viscosity
+
+
+# ---- solids -------------------------------------------------------------------------------------------------
+
+
+class Damping(Table):
+    """Rayleigh damping C = mass * M + stiffness * K'."""
+
+    mass: Annotated[Real, Field(ge=0, description="1/s")] = 0.0
+    stiffness: Annotated[Real, Field(ge=0, description="s")] = 0.0
+
+
+def _where_form(value: Any) -> str:
+    return "<table>" if isinstance(value, dict | Shape) else "<name>"
+
+
+class Support(Table):
+    """Nodes whose motion is prescribed.
+
+    ``where`` is a side of the solid's bounding box (left, right, bottom, top, back, front, all) or a shape.
+    """
+
+    where: Annotated[
+        Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")],
+        Discriminator(_where_form),
+        Field(description="or a shape such as { box = { origin = ..., size = ... } }"),
+    ]
+    fix: Annotated[list[Axis], Field(min_length=1, description="axes that are held")]
+    velocity: Annotated[dict[Axis, Number], Field(description="m/s of fixed axes; may depend on x, y, z, t")] = {}
+
+
+class SolidInitial(Table):
+    """The solid at time zero."""
+
+    velocity: Annotated[list[Number] | None, Field(description="m/s; may depend on x, y, z")] = None
+    displacement: Annotated[list[Number] | None, Field(description="m; may depend on x, y, z")] = None
+
+
+class Solid(Table):
+    """A deformable body of linear triangles or tetrahedra."""
+
+    shape: Shape
+    density: Annotated[Real, Field(gt=0, description="kg/m^3")]
+    young: Annotated[Real, Field(gt=0, description="Pa")]
+    poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
+    material: Literal["green"] = "green"
+    mass: Literal["consistent", "lumped"] = "consistent"
+    interior: Literal["fluid", "void"] = "fluid"
+    damping: Damping = Damping()
+    supports: list[Support] = []
+    initial: SolidInitial = SolidInitial()
+
+
+class Obstacle(Table):
+    """A static rigid shape; ``outside`` turns it into a container."""
+
+    shape: Shape
+    outside: Flag = False
+
+
+# ---- the rest -----------------------------------------------------------------------------------------------
+
+
+class Coupling(Table):
+    """How fluid and solids are joined."""
+
+    transfer: Literal["ray"] = "ray"
+    #: Facets are split until their pieces are about a cell / quadrature.
+    quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
+
+
+class Probe(Table):
+    """A quantity written to every row of history.csv."""
+
+    of: Annotated[str, Field(description="a solid's name, or fluid")]
+    at: Annotated[Vector, Field(description="m; in a solid, where the point is at rest")]
+    quantity: Literal["displacement", "velocity", "pressure", "smoke"]
+
+
+class Output(Table):
+    """When fields are written; none means never."""
+
+    every: Annotated[Annotated[Real, Field(gt=0)] | None, Field(description="s")] = None
+
+
+class Checkpoint(Table):
+    """When checkpoints are written and how many stay."""
+
+    every: Annotated[Annotated[Real, Field(gt=0)] | None, Field(description="s of scene time")] = None
+    keep: Annotated[Whole, Field(ge=1)] = 3
+
+
+class Scene(Table):
+    """A whole scene."""
+
+    title: str = ""
+    dim: Literal[2, 3]
+    gravity: Annotated[list[Number] | None, Field(description="m/s^2; may depend on t")] = None
+    time: Time
+    fluid: Fluid | None = None
+    solids: dict[str, Solid] = {}
+    obstacles: dict[str, Obstacle] = {}
+    coupling: Coupling = Coupling()
+    probes: dict[str, Probe] = {}
+    output: Output = Output()
+    checkpoint: Checkpoint = Checkpoint()
+
+    _directory: Path = PrivateAttr(default=Path())
+
+    def model_post_init(self, context: Any) -> None:
+        """Remember where the scene was read."""
+        if context:
+            self._directory = Path(context["directory"])
+
+    @property
+    def directory(self) -> Path:
+        """What relative mesh paths are relative to; of a loaded scene they are absolute already."""
+        return self._directory
+
+    def __eq__(self, other: object) -> bool:
+        """Compare what is said, not where it was read."""
+        return isinstance(other, Scene) and self.model_dump() == other.model_dump()
+
+    __hash__ = None  # type: ignore[assignment]

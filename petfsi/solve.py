@@ -1,0 +1,259 @@
+"""The solver of a step, from PETSc options, and the story it tells when it fails."""
+
+from __future__ import annotations
+
+import sysconfig
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+from petsc4py import PETSc
+
+from petfsi import petsc
+from petfsi.errors import InputError, SolveError
+from petfsi.system import System
+
+#: The coupled solve; a single field's own solve has the prefix that it has inside the coupled one.
+PREFIX = "fsi_"
+DEFAULT = "monolithic.opts"
+
+#: How far the true residual may lie above the tolerance that the solver itself tested.
+SLACK = 10.0
+
+
+def field_prefix(name: str) -> str:
+    """Return the options prefix of a field's own solver."""
+    return f"{PREFIX}fieldsplit_{name}_"
+
+
+def options_directory() -> Path:
+    """Return where the shipped options files are: beside the package in a checkout, else in the installation."""
+    checkout = Path(__file__).parents[1] / "options"
+    return checkout if checkout.is_dir() else Path(sysconfig.get_path("data")) / "share" / "petfsi" / "options"
+
+
+def shipped_options() -> list[Path]:
+    """Return the shipped options files, by name."""
+    return sorted(options_directory().glob("*.opts"))
+
+
+def load_options(args: list[str], fields: list[str], base: Path | None = None) -> None:
+    """Fill PETSc's database: an options file, and the command line over it. Collective.
+
+    Parameters
+    ----------
+    args : list of str
+        PETSc options as given; ``-options_file`` may name a shipped file without its folder.
+    fields : list of str
+        The scene's fields. A single one reads nothing but the options under its own prefix and takes those of
+        ``monolithic.opts`` when the file has none.
+    base : Path, optional
+        The file used when the command line names none; ``monolithic.opts`` by default.
+    """
+    default = options_directory() / DEFAULT
+    rest, files = [], []
+    words = iter(args)
+    for word in words:
+        if word == "-options_file":
+            files.append(Path(next(words, "")))
+        else:
+            rest.append(word)
+    for path in files or [base or default]:
+        shipped = options_directory() / path.name
+        petsc.insert_options_file(shipped if not path.exists() and path.parent == Path(".") and shipped.exists() else path)
+    database = PETSc.Options()
+    if len(fields) == 1 and not any(name.startswith(field_prefix(fields[0])) for name in database.getAll()):
+        petsc.insert_options(_lines_with_prefix(default, field_prefix(fields[0])))
+    petsc.insert_options(rest)
+
+
+def _lines_with_prefix(path: Path, prefix: str) -> list[str]:
+    lines = [line.split("#")[0].split() for line in path.read_text().splitlines()]
+    return [word for words in lines if words and words[0].startswith("-" + prefix) for word in words]
+
+
+def dump_options() -> str:
+    """Return petfsi's options in force, as an options file."""
+    names = PETSc.Options().getAll()
+    return "".join(f"-{name} {value}".rstrip() + "\n" for name, value in sorted(names.items()) if name.startswith(PREFIX))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a solve reports: iterations (of the pressure's solver where the outer one only applies it), |b - Kx|/|b|."""
+
+    iterations: int
+    residual: float
+
+
+class Solver:
+    """One KSP on the system's operator.
+
+    Its type, tolerances and everything inside come from PETSc options under ``fsi_``; see ``options/``.
+
+    Attributes
+    ----------
+    decoupled : bool
+        Whether each block is inverted by itself (a fieldsplit other than Schur's), so that a region closed by
+        an elastic wall is singular to the pressure block though not to the system.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        single = len(system.fields) == 1
+        self.prefix = field_prefix(system.fields[0].name) if single else PREFIX
+        options = PETSc.Options(self.prefix)
+        self.converts = options.getString("mat_type", "nest") == "aij" and not single
+        split = options.getString("pc_fieldsplit_type", "multiplicative")
+        self.decoupled = not single and options.getString("pc_type", "") == "fieldsplit" and split != "schur"
+        # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
+        self.fixed_iterations = options.getString("ksp_convergence_test", "default") == "skip"
+        self._ksp: PETSc.KSP | None = None
+        self._monolith: PETSc.Mat | None = None
+        self._inner_iterations = 0
+
+    def set_up(self) -> None:
+        """Create the KSP if there is none and let everything inside it read its options. Collective."""
+        try:
+            if self._ksp is None:
+                self._ksp = self._create()
+            elif self.converts:
+                self._ksp.setOperators(self._convert())
+            self._ksp.setUp()
+        except PETSc.Error as error:
+            raise InputError(_option_story(self.prefix, error)) from None
+
+    def _create(self) -> PETSc.KSP:
+        system = self.system
+        ksp = PETSc.KSP().create(system.comm)
+        ksp.setOptionsPrefix(self.prefix)
+        ksp.setOperators(self._convert() if self.converts else system.operator)
+        ksp.setFromOptions()
+        if system.index_sets and ksp.getPC().getType() == PETSc.PC.Type.FIELDSPLIT:
+            ksp.getPC().setFieldSplitIS(*system.index_sets)  # heard only between setFromOptions and setUp
+        ksp.setUp()
+        for sub in self._sub_solvers(ksp):
+            if sub.getType() != PETSc.KSP.Type.PREONLY:
+                sub.setMonitor(self._count)
+        return ksp
+
+    def _convert(self) -> PETSc.Mat:
+        if self._monolith is not None:
+            self._monolith.destroy()  # its pattern may have changed
+        self._monolith = self.system.operator.convert("aij", PETSc.Mat())
+        return self._monolith
+
+    def _count(self, _ksp: PETSc.KSP, iteration: int, _norm: float) -> None:
+        self._inner_iterations += iteration > 0
+
+    @staticmethod
+    def _sub_solvers(ksp: PETSc.KSP) -> list[PETSc.KSP]:
+        pc = ksp.getPC()
+        return list(pc.getFieldSplitSubKSP()) if pc.getType() == PETSc.PC.Type.FIELDSPLIT else []
+
+    def reset(self) -> None:
+        """Forget everything but the options, so that the next solve is that of a fresh process. Collective."""
+        if self._ksp is not None:
+            self._ksp.destroy()
+            self._ksp = None
+
+    def solve(self, changed: bool) -> Outcome:
+        """Solve for the system's solution, from its first guess. Collective.
+
+        Parameters
+        ----------
+        changed : bool
+            Whether the operator differs from that of the last call.
+
+        Raises
+        ------
+        SolveError
+            On every rank, with the reason and the residual of each field.
+        """
+        if changed or self._ksp is None:
+            self.set_up()
+        ksp, system = self._ksp, self.system
+        assert ksp is not None
+        self._inner_iterations = 0
+        try:
+            ksp.solve(system.rhs, system.solution)
+        except PETSc.Error as error:
+            raise SolveError(f"solver '{self.prefix}' broke down: {_petsc_text(error)}") from None
+        norms = system.update_residual()
+        self._judge(ksp, norms)
+        relative = norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0
+        return Outcome(max(self._inner_iterations, ksp.getIterationNumber()), relative)
+
+    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float]) -> None:
+        """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
+        solvers = [ksp, *self._sub_solvers(ksp)]
+        iterative = [s.getTolerances()[0] for s in solvers if s.getType() != PETSc.KSP.Type.PREONLY]
+        outer = ksp.getType() != PETSc.KSP.Type.PREONLY
+        rtol = iterative[0] if outer else max(iterative, default=1e-8)
+        wanted = SLACK * rtol * norms["rhs"]
+        failed = [s for s in solvers if s.getConvergedReason() < 0]
+        finite = np.isfinite(norms[""])
+        if self.fixed_iterations:
+            good = finite and not failed
+        else:
+            good = finite and ksp.getConvergedReason() >= 0 and norms[""] <= wanted
+        if good:
+            return
+        by_field = ", ".join(f"{field.name} {norms[field.name]:.1e}" for field in self.system.fields)
+        culprit = failed[-1] if failed else ksp
+        raise SolveError(
+            f"solver '{culprit.getOptionsPrefix()}' stopped with {petsc.reason_name(culprit)} after "
+            f"{culprit.getIterationNumber()} iterations: |b - Kx| = {norms['']:.1e}, wanted {wanted:.1e} "
+            f"(|b| = {norms['rhs']:.1e}); by field: {by_field}. To tell the solver from the physics, run this step "
+            f"with -options_file monolithic-direct.opts."
+        )
+
+    def check_options(self) -> list[str]:
+        """Set up, refuse petfsi options that nothing has read, and return the other unread ones, to warn of.
+
+        Collective. Some inner solvers read their options when they are first used, so the preconditioner is
+        applied once.
+
+        Raises
+        ------
+        InputError
+            Naming each option, with the nearest one that was read.
+        """
+        self.set_up()
+        assert self._ksp is not None
+        try:
+            self._ksp.getPC().apply(self.system.rhs, self.system.residual)
+        except PETSc.Error as error:
+            raise InputError(_option_story(self.prefix, error)) from None
+        unread = petsc.unread_options(PREFIX)
+        if not self.system.index_sets:  # options of the coupled solve wait for a scene that couples
+            unread = [name for name in unread if name.startswith(self.prefix)]
+        if unread:
+            every = PETSc.Options().getAll()
+            known = sorted(set(COMMON) | {n.removeprefix(self.prefix) for n in every if n not in unread})
+            lines = []
+            for name in unread:
+                near = get_close_matches(name.removeprefix(self.prefix), known, 1)
+                hint = f"; did you mean -{self.prefix}{near[0]}?" if near else ""
+                lines.append(f"option -{name}: no solver of this scene reads it{hint}")
+            raise InputError("\n".join(lines))
+        return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
+
+
+#: Names worth suggesting for a misspelt option, besides those in force.
+COMMON = (
+    "ksp_type ksp_rtol ksp_atol ksp_max_it ksp_monitor ksp_view ksp_pc_side ksp_norm_type "
+    "ksp_initial_guess_nonzero ksp_convergence_test ksp_converged_reason pc_type pc_fieldsplit_type mat_type "
+    "pc_fieldsplit_schur_fact_type pc_fieldsplit_schur_precondition pc_factor_mat_solver_type"
+).split()
+
+
+def _petsc_text(error: PETSc.Error) -> str:
+    """Return the last words of a PETSc error: what it said, without where in PETSc."""
+    lines = [line.split("]", 1)[-1].strip() for line in str(error).splitlines()]
+    return next((line for line in reversed(lines) if line and "()" not in line), f"error code {error.ierr}")
+
+
+def _option_story(prefix: str, error: PETSc.Error) -> str:
+    return f"options -{prefix}...: PETSc cannot set this solver up: {_petsc_text(error)} (code {error.ierr})"

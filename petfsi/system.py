@@ -1,0 +1,111 @@
+"""Blocks by field name, laid out as one nest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from petfsi.couplings.base import Coupling
+from petfsi.fields.base import Field
+
+
+class System:
+    """The linear system of a step, in the units of the solver.
+
+    With the fields' blocks on the diagonal and the couplings' off it,
+
+        sum_j  r_i K_ij c_j  (x_j / c_j)  =  r_i b_i ,
+
+    where r and c are the fields' row and column scales: all residuals and unknowns are then comparable numbers
+    (m/s where there is a fluid). A single field needs no nest; its block is the operator.
+
+    Attributes
+    ----------
+    operator : PETSc.Mat
+        The nest, or the single block; the same object for the whole run.
+    rhs, solution : PETSc.Vec
+        Scaled; ``solution`` holds the first guess before the solve.
+    index_sets : list of (str, PETSc.IS)
+        The unknowns of each field; empty for a single field.
+    """
+
+    def __init__(self, comm: MPI.Comm, fields: Sequence[Field], couplings: Sequence[Coupling]) -> None:
+        self.comm = comm
+        self.fields = list(fields)
+        self.couplings = list(couplings)
+        self.index_sets: list[tuple[str, PETSc.IS]] = []
+        if len(self.fields) == 1:
+            self.operator = self.fields[0].block
+        else:
+            names = [field.name for field in self.fields]
+            rows: list[list[PETSc.Mat | None]] = [[None] * len(names) for _ in names]
+            for n, field in enumerate(self.fields):
+                rows[n][n] = field.block
+            for coupling in self.couplings:
+                for (row, col), block in coupling.blocks.items():
+                    rows[names.index(row)][names.index(col)] = block
+            self.operator = PETSc.Mat().createNest(rows, comm=comm)
+            self.operator.setUp()
+            self.index_sets = list(zip(names, self.operator.getNestISs()[0], strict=True))
+        self.solution, self.rhs = self.operator.createVecs()
+        self.residual = self.rhs.duplicate()
+        offsets = np.cumsum([0] + [field.layout.n_local for field in self.fields])
+        self._pieces = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+        self._seen: dict[object, int] = {}
+
+    @property
+    def unknowns(self) -> dict[str, int]:
+        """Unknowns of each field."""
+        return {field.name: field.layout.n_global for field in self.fields}
+
+    def refresh(self) -> bool:
+        """Scale what was assembled anew, fill right-hand side and first guess; say whether the operator changed.
+
+        Collective.
+        """
+        changed = False
+        scales = {field.name: (field.row_scale, field.col_scale) for field in self.fields}
+        for field in self.fields:
+            if self._is_new(field, field.n_assembled):
+                field.block.scale(field.row_scale * field.col_scale)
+                changed = True
+        for coupling in self.couplings:
+            if self._is_new(coupling, coupling.n_assembled):
+                for (row, col), block in coupling.blocks.items():
+                    block.scale(scales[row][0] * scales[col][1])
+                changed = True
+        if changed and self.index_sets:
+            self.operator.assemble()  # else Schur complements formed by PETSc keep the old values
+        for field, piece in zip(self.fields, self._pieces, strict=True):
+            self.rhs.array[piece] = field.row_scale * field.rhs
+            self.solution.array[piece] = field.unknown() / field.col_scale
+        return changed
+
+    def _is_new(self, part: Field | Coupling, count: int) -> bool:
+        new = self._seen.get(part) != count
+        self._seen[part] = count
+        return new
+
+    def update_residual(self) -> dict[str, float]:
+        """Compute rhs - operator * solution and return its norm by field, and of all under ``""``. Collective."""
+        self.operator.mult(self.solution, self.residual)
+        self.residual.aypx(-1.0, self.rhs)
+        r, b = self.residual.array, self.rhs.array
+        squares = [r[piece] @ r[piece] for piece in self._pieces] + [b @ b]
+        total = np.sqrt(self.comm.allreduce(np.array(squares)))
+        norms = {field.name: float(n) for field, n in zip(self.fields, total, strict=False)}
+        norms[""] = float(np.sqrt(np.sum(total[:-1] ** 2)))
+        norms["rhs"] = float(total[-1])
+        return norms
+
+    def values(self) -> list[np.ndarray]:
+        """Return the solution of each field on this rank, SI."""
+        x = self.solution.array
+        return [x[piece] * field.col_scale for field, piece in zip(self.fields, self._pieces, strict=True)]
+
+    def piece(self, name: str) -> slice:
+        """Return where a field's unknowns lie in the local vectors."""
+        return self._pieces[[field.name for field in self.fields].index(name)]

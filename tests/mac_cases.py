@@ -1,0 +1,86 @@
+"""What the tests of the fluid share: scenes, a solver, whole arrays."""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from petfsi.fields.mac.fluid import MacFluid
+from petfsi.scene.schema import Scene
+
+PERIODIC = {"left": "periodic", "right": "periodic", "bottom": "periodic", "top": "periodic"}
+
+
+def make_scene(cells, gravity=None, obstacles=None, **fluid):
+    dim = len(cells)
+    fluid = {"origin": [0.0] * dim, "size": [1.0] * dim, "density": 1000.0, "cells": list(cells)} | fluid
+    scene = {"dim": dim, "time": {"end": 1.0, "dt": 0.1}, "fluid": fluid, "obstacles": obstacles or {}}
+    if gravity is not None:
+        scene["gravity"] = gravity
+    return Scene.model_validate(scene)
+
+
+def make_fluid(cells, comm=MPI.COMM_WORLD, **scene):
+    return MacFluid(comm, make_scene(cells, **scene))
+
+
+def solve(fluid):
+    """Return the pressure that solves the fluid's own system, closed regions without mean."""
+    block, layout = fluid.block, fluid.layout
+    b, x = block.createVecRight(), block.createVecRight()
+    rhs = fluid.rhs * fluid.row_scale
+    regions = [vec for vec, _ in fluid.closed_regions(None)]
+    basis = []
+    for vec in regions:
+        unit = PETSc.Vec().createWithArray(vec.copy(), size=layout.sizes, comm=fluid.comm)
+        unit.normalize()
+        basis.append(unit)
+    scaled = block.copy()
+    scaled.scale(fluid.row_scale * fluid.col_scale)
+    ksp = PETSc.KSP().create(fluid.comm)
+    ksp.setOperators(scaled)
+    b.array[:] = rhs
+    if basis:
+        space = PETSc.NullSpace().create(vectors=basis, comm=fluid.comm)
+        scaled.setNullSpace(space)
+        space.remove(b)
+        ksp.setType("cg")
+        ksp.getPC().setType("hypre")
+        ksp.setTolerances(rtol=1e-14, atol=1e-14, max_it=100)
+    else:
+        ksp.setType("preonly")
+        ksp.getPC().setType("cholesky")
+        ksp.getPC().setFactorSolverType("mumps")
+    ksp.solve(b, x)
+    return x.array * fluid.col_scale
+
+
+def step(fluid, time, dt):
+    fluid.predict(time, dt)
+    fluid.assemble(time, dt)
+    fluid.accept(solve(fluid), time, dt)
+
+
+def whole(comm, slab):
+    """Return a global array from its pieces, on every rank."""
+    pieces = comm.allgather(slab)
+    array = np.zeros(slab.shape, dtype=slab.data.dtype)
+    for piece in pieces:
+        array[tuple(slice(s, s + n) for s, n in zip(piece.start, piece.data.shape, strict=True))] = piece.data
+    return array
+
+
+def whole_state(fluid):
+    return {name: whole(fluid.comm, slab) for name, slab in fluid.state().items()}
+
+
+def reader(arrays):
+    def read(name, start, count):
+        return arrays[name][tuple(slice(s, s + n) for s, n in zip(start, count, strict=True))]
+
+    return read
+
+
+def set_velocity(fluid, functions):
+    """Set the velocity everywhere, ghosts included, from functions of x, y, z."""
+    for axis, function in enumerate(functions):
+        fluid.velocity[axis][...] = function(*fluid.grid.coordinates(axis))

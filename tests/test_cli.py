@@ -1,0 +1,352 @@
+import io
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from petfsi import __version__, cli
+from petfsi.console import Console
+from petfsi.errors import InputError, SolveError
+from petfsi.plan import DEFAULT_OPTIONS, describe_plan, skipped
+from petfsi.scene.load import scene_from_dict
+
+SCENE = """
+title = "A sheet in a duct"
+dim = 2
+[time]
+end = 1.0
+dt = 0.1
+[fluid]
+density = 1000.0
+origin = [0.0, 0.0]
+size = [2.0, 1.0]
+cells = [8, 4]
+[solids.sheet]
+shape = { box = { origin = [0.5, 0.0], size = [0.25, 0.5], cells = [2, 4] } }
+density = 1200.0
+young = 1.0e5
+poisson = 0.3
+[output]
+every = 0.3
+"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "sheet.toml"
+    path.write_text(SCENE)
+    return path
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Stand in for the solver; return what it was called with."""
+    seen: list = []
+    module = types.ModuleType("petfsi.run")
+    module.run_scene = lambda *args: seen.append(args) or 0
+    module.resume_run = lambda *args: seen.append(args) or 75
+    monkeypatch.setitem(sys.modules, "petfsi.run", module)
+    monkeypatch.setattr(cli, "_start_petsc", lambda options: None)
+    return seen
+
+
+def fail_with(monkeypatch, error):
+    def work(*_args):
+        raise error
+
+    sys.modules["petfsi.run"].run_scene = work
+
+
+def petfsi(*args, ranks=0, code=None, **variables):
+    """Run petfsi, or a piece of Python, as a user does: in a process of its own."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_MCA", "OMPI_COMM", "PMIX", "ORTE"))}
+    env |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"} | variables
+    launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+    what = ["-c", code] if code else ["-m", "petfsi.cli"]
+    command = [*launcher, sys.executable, *what, *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60)
+
+
+# ---- what is passed on --------------------------------------------------------------------------------------
+
+
+def test_run_passes_everything_on(scene, calls):
+    status = cli.main(
+        ["run", str(scene), "--set", "time.dt=0.05", "-fsi_ksp_rtol", "1e-6", "--out", "somewhere", "-log_view"]
+        + ["--steps=7", "-shift", "-1.5", "--overwrite", "--wall-limit", "60", "-options_file", "split.opts"]
+        + ["--set", "solids.sheet.young=2e5"]
+    )
+    assert status == 0
+    (loaded, out, steps, petsc, wall_limit, overwrite) = calls[0]
+    assert loaded.time.dt == 0.05 and loaded.solids["sheet"].young == 2e5
+    assert (out, steps, wall_limit, overwrite) == (Path("somewhere"), 7, 60.0, True)
+    assert petsc == ["-fsi_ksp_rtol", "1e-6", "-log_view", "-shift", "-1.5", "-options_file", "split.opts"]
+
+
+def test_run_has_defaults(scene, calls):
+    assert cli.main(["run", str(scene)]) == 0
+    assert calls[0][1:] == (Path("runs/sheet"), None, [], None, False)
+
+
+def test_resume_passes_everything_on(calls):
+    assert cli.main(["resume", "runs/a", "--set", "time.end=2", "--steps", "3", "-fsi_pc_type", "lu"]) == 75
+    assert calls == [(Path("runs/a"), 3, ["-fsi_pc_type", "lu"], None, ["time.end=2"])]
+
+
+def test_plot_names_its_pictures(monkeypatch, capsys):
+    module = types.ModuleType("petfsi.output.pictures")
+    module.plot_run = lambda directory, every: [directory / f"{every}.png"]
+    monkeypatch.setitem(sys.modules, "petfsi.output.pictures", module)
+    assert cli.main(["plot", "runs/a", "--every", "5"]) == 0
+    assert capsys.readouterr().out == "runs/a/5.png\n"
+
+
+# ---- what is refused ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "args, said",
+    [
+        (["run", "SCENE", "--stesp", "3"], "--steps"),
+        (["run", "SCENE", "--fsi_ksp_type", "cg"], "No such option"),
+        (["run", "SCENE", "-steps", "3"], "'-steps': petfsi's own options have two dashes: --steps"),
+        (["run", "SCENE", "-out", "x"], "two dashes: --out"),
+        (["run", "SCENE", "--steps", "0"], "Invalid value for '--steps'"),
+        (["run", "SCENE", "--steps", "many"], "Invalid value for '--steps'"),
+        (["run", "SCENE", "--wall-limit", "0"], "Invalid value for '--wall-limit'"),
+        (["run", "SCENE", "--out"], "requires an argument"),
+        (["run", "SCENE", "stray"], "unexpected extra argument (stray)"),
+        (["run"], "Missing argument 'SCENE'"),
+        (["run", "-log_view", "SCENE"], "Give it before the PETSc options"),
+        (["runn"], "No such command 'runn'"),
+        (["resume"], "Missing argument 'DIR'"),
+        (["resume", "runs/a", "--overwrite"], "No such option"),
+        (["plot", "runs/a", "--every", "0"], "Invalid value for '--every'"),
+        (["plot", "runs/a", "-fsi_pc_type"], "No such option"),
+        (["run", "SCENE", "--set", "time.dt"], "must be key=value"),
+        (["run", "SCENE", "--set", "time.dtt=1"], "did you mean 'dt' (s)?"),
+        (["check", "SCENE", "--set", "fluid.density=-1"], "must be greater than 0 (kg/m^3)"),
+        (["run", "missing.toml"], "missing.toml: no such file"),
+        (["check", "."], "is a folder"),
+    ],
+)
+def test_a_mistake_on_the_command_line_ends_in_2(scene, calls, capsys, args, said):
+    assert cli.main([str(scene) if a == "SCENE" else a for a in args]) == 2
+    captured = capsys.readouterr()
+    assert said in captured.err and captured.out == "" and "Traceback" not in captured.err
+    assert calls == []
+
+
+def test_click_tells_the_same_exit_code(scene, calls):
+    runner = CliRunner()
+    assert runner.invoke(cli.cli, ["run", str(scene)]).exit_code == 0
+    assert runner.invoke(cli.cli, ["run", str(scene), "--stesp", "3"]).exit_code == 2
+    assert runner.invoke(cli.cli, ["resume", "runs/a"]).exit_code == 75
+    assert runner.invoke(cli.cli, ["--version"]).output == f"petfsi {__version__}\n"
+
+
+# ---- how commands end ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error, code, said",
+    [
+        (InputError("solids.a.density = -1: must be greater than 0"), 2, "petfsi: solids.a.density = -1: must be"),
+        (SolveError("step 3: DIVERGED"), 3, "petfsi: step 3: DIVERGED\n"),
+        (KeyboardInterrupt(), 130, "petfsi: interrupted\n"),
+        (MemoryError(), 1, "'petfsi check' estimates what a scene needs"),
+        (OSError(28, "No space left on device", "history.csv"), 1, "petfsi: history.csv: No space left on device\n"),
+        (ZeroDivisionError("division\nby zero"), 1, "ZeroDivisionError: division by zero (at petfsi/cli.py:"),
+        (RuntimeError("x" * 1000), 1, "this is a defect in petfsi; set PETFSI_TRACEBACK=1"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_each_error_has_its_exit_code_and_no_traceback(scene, calls, monkeypatch, capsys, error, code, said):
+    fail_with(monkeypatch, error)
+    assert cli.main(["run", str(scene)]) == code
+    captured = capsys.readouterr()
+    assert said in captured.err and captured.out == "" and "Traceback" not in captured.err
+    assert len(captured.err.splitlines()) == 1 and len(captured.err) < 600
+
+
+def test_a_traceback_comes_when_it_is_asked_for(scene, calls, monkeypatch, capsys):
+    fail_with(monkeypatch, ZeroDivisionError("here"))
+    monkeypatch.setenv("PETFSI_TRACEBACK", "1")
+    assert cli.main(["run", str(scene)]) == 1
+    assert "Traceback (most recent call last)" in capsys.readouterr().err
+
+
+def test_help_costs_no_heavy_import():
+    code = "import sys; from petfsi import cli; cli.main(['run', '--help']); print(sorted(sys.modules))"
+    modules = petfsi(code=code).stdout.splitlines()[-1]
+    for name in ("'petsc4py'", "'mpi4py'", "'numba'", "'matplotlib'", "'numpy'", "'pydantic'"):
+        assert name not in modules
+
+
+def test_check_starts_neither_petsc_nor_mpi(scene):
+    code = f"import sys; from petfsi import cli; cli.main(['check', {str(scene)!r}]); print(sorted(sys.modules))"
+    modules = petfsi(code=code).stdout.splitlines()[-1]
+    assert "'pydantic'" in modules
+    for name in ("'petsc4py.PETSc'", "'mpi4py.MPI'", "'numba'", "'matplotlib'"):
+        assert name not in modules
+
+
+def test_a_shell_sees_the_exit_code(scene):
+    done = petfsi("check", scene)
+    assert (done.returncode, done.stderr) == (0, "") and "A sheet in a duct" in done.stdout
+    done = petfsi("check", scene, "--set", "time.dt=fast")
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr == f'petfsi: {scene}: one mistake\n  time.dt = "fast": must be a number (s)\n'
+    assert petfsi("--version").stdout == f"petfsi {__version__}\n"
+
+
+TOGETHER = """
+import sys
+from petfsi import cli
+from petfsi.errors import InputError, SolveError
+cli.AGREE_SECONDS = {patience}
+def work(comm):
+    {body}
+sys.exit(cli._together(work))
+"""
+
+
+def test_ranks_that_fail_together_speak_once():
+    done = petfsi(ranks=2, code=TOGETHER.format(patience=20, body="raise SolveError('step 7: DIVERGED')"))
+    assert done.returncode == 3
+    assert done.stderr.count("step 7: DIVERGED") == 1
+
+
+def test_a_rank_that_fails_alone_ends_the_others():
+    body = "comm.Barrier() if comm.rank == 0 else [][1]"
+    done = petfsi(ranks=2, code=TOGETHER.format(patience=0.5, body=body))
+    assert done.returncode == 1
+    assert "rank 1 of 2 failed alone: IndexError: list index out of range" in done.stderr
+
+
+def test_ranks_with_different_stories_tell_them_all():
+    body = "raise InputError(f'rank {comm.rank} saw a mistake')"
+    done = petfsi(ranks=2, code=TOGETHER.format(patience=20, body=body))
+    assert done.returncode == 2
+    assert "rank 0 saw a mistake" in done.stderr and "rank 1 saw a mistake" in done.stderr
+
+
+def test_a_broken_scene_is_reported_once_under_mpirun(scene):
+    done = petfsi("run", scene, "--set", "time.dt=-1", ranks=2)
+    assert done.returncode == 2
+    assert done.stderr.count("time.dt = -1: must be greater than 0 (s)") == 1
+    done = petfsi("run", scene, "--stesp", "1", ranks=2)
+    assert done.returncode == 2 and done.stderr.count("Error: ") == 1
+
+
+# ---- the plan -----------------------------------------------------------------------------------------------
+
+
+def plan_scene(**changes):
+    import tomllib
+
+    return scene_from_dict(tomllib.loads(SCENE) | changes)
+
+
+def test_the_plan_counts_what_is_solved():
+    plan = dict(line.split(":", 1) for line in describe_plan(plan_scene()).splitlines() if ":" in line)
+    assert plan["pressure"].strip() == "32 unknowns, one per cell of 8 x 4"
+    assert plan["solid"].strip() == "30 unknowns (sheet 15 nodes, 16 cells)"
+    assert plan["in all"].strip() == "62 unknowns"
+    assert plan["steps"].strip() == "10 of 0.1 s to 1 s, newmark"
+    assert plan["outputs"].strip().startswith("5, every 0.3 s")
+    assert plan["options"].strip() == f"{DEFAULT_OPTIONS} (the default)"
+
+
+def test_the_plan_says_which_options_apply():
+    text = describe_plan(plan_scene(), ["-fsi_ksp_rtol", "1e-6", "-options_file", "split.opts", "-log_view"])
+    assert "options:     split.opts; over it -fsi_ksp_rtol 1e-6 -log_view\n" in text
+
+
+def test_the_plan_counts_the_nodes_of_meshes_as_they_are_built(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    points = [[0.5, 0.0], [1.0, 0.0], [1.0, 0.5], [0.5, 0.5]]
+    meshio.Mesh(points, [("triangle", [[0, 1, 2], [0, 2, 3]])]).write(tmp_path / "square.vtk")
+    solid = {"shape": {"mesh": "square.vtk"}, "density": 1.0, "young": 1.0, "poisson": 0.0}
+    scene = scene_from_dict({**plan_scene().model_dump(exclude={"fluid", "solids"}), "solids": {"a": solid}}, tmp_path)
+    assert "8 unknowns (a 4 nodes, 2 cells)" in describe_plan(scene)
+    solid["shape"]["translate"] = [0.0, 2.0]
+    fluid = {"density": 1.0, "origin": [0.0, 0.0], "size": [2.0, 1.0], "cells": [4, 2]}
+    wet = {**plan_scene().model_dump(exclude={"fluid", "solids"}), "solids": {"a": solid}, "fluid": fluid}
+    with pytest.raises(InputError, match="solids.a.shape = .*y must lie inside the fluid's grid"):
+        describe_plan(scene_from_dict(wet, tmp_path))
+
+
+def test_what_is_skipped_has_a_reason():
+    dry = skipped(plan_scene(fluid=None))
+    assert any(line.startswith("fluid, nest and coupling: the scene has no [fluid]") for line in dry)
+    still = skipped(plan_scene(solids={}))
+    assert any(line.startswith("solid, nest and coupling") for line in still)
+    both = skipped(plan_scene())
+    assert any(line.startswith("smoke") for line in both) and not any("nest" in line for line in both)
+
+
+def test_info_lists_versions_prefixes_and_options_files():
+    from petfsi import solve
+    from petfsi.plan import describe_info
+
+    text = describe_info()
+    assert f"petfsi:     {__version__}" in text and "PETSc:" in text and "h5py:" in text
+    for prefix in ("-fsi_ ", "-fsi_fieldsplit_solid_ ", "-fsi_fieldsplit_pressure_ "):
+        assert prefix in text
+    assert solve.DEFAULT == DEFAULT_OPTIONS and DEFAULT_OPTIONS in text
+    for path in solve.shipped_options():
+        line = next(line for line in text.splitlines() if line.split()[:1] == [path.name])
+        assert line.endswith((".", ":")), f"{path} has no opening sentence"
+
+
+# ---- the console --------------------------------------------------------------------------------------------
+
+
+def test_a_batch_log_has_a_line_a_step_and_so_has_the_log_file(tmp_path, capsys):
+    log = tmp_path / "log.txt"
+    log.write_text("before\n")
+    with Console(0, log, total=200) as console:
+        console.note("petfsi: unknowns: pressure 32")
+        console.step(118, 0.236, 0.002, 23, 4.1e-9, 0.814)
+        console.warn("option -x was read by nothing")
+    lines = [
+        "petfsi: unknowns: pressure 32",
+        "step 118  t 0.2360  dt 0.002  its 23  res 4.1e-09  0.81 s",
+        "warning: option -x was read by nothing",
+    ]
+    assert capsys.readouterr().out.splitlines() == lines
+    assert log.read_text().splitlines() == ["before", *lines]
+
+
+def test_other_ranks_are_silent(tmp_path, capsys):
+    with Console(1, tmp_path / "log.txt") as console:
+        console.note("a")
+        console.step(1, 0.1, 0.1, 1, 0.0, 0.0)
+    assert capsys.readouterr().out == "" and not (tmp_path / "log.txt").exists()
+
+
+def test_a_terminal_shows_a_bar_and_the_log_file_every_step(tmp_path, monkeypatch):
+    screen = io.StringIO()
+    screen.isatty = lambda: True
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    with Console(0, tmp_path / "log.txt", total=2) as console:
+        console.note("[not] markup")
+        for step in (1, 2):
+            console.step(step, 0.1 * step, 0.1, 5, 1e-9, 0.01)
+    assert "[not] markup" in screen.getvalue() and "its 5" in screen.getvalue()
+    log = (tmp_path / "log.txt").read_text().splitlines()
+    assert [line[:6] for line in log] == ["[not] ", "step 1", "step 2"]
+
+
+def test_every_option_is_explained():
+    for command in cli.cli.commands.values():
+        for parameter in command.params:
+            assert isinstance(parameter, click.Argument) or parameter.help

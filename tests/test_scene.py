@@ -1,0 +1,595 @@
+import copy
+import pickle
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from petfsi.errors import InputError
+from petfsi.scene.checks import RESERVED_PROBES, check_inside_grid, expressions
+from petfsi.scene.load import RESUMABLE, apply_set, dump_scene, load_scene, parse_value, scene_from_dict
+from petfsi.scene.schema import Scene
+
+LAYER = """
+title = "An elastic \\"layer\\" under water, \\u00b0C \\\\ \\u007f"
+dim = 2
+gravity = [0.0, "-9.81*min(t, 1)"]
+
+[time]
+end = 2.0
+dt = 0.01
+
+[fluid]
+density = 1000.0
+origin = [0.0, 0.0]
+size = [1.0, 2.0]
+cells = [32, 64]
+smoke = { initial = "x", buoyancy = 0.5 }
+[fluid.sides]
+top = "open"
+right = { inflow = { speed = "1 - y", region = { ball = { centre = [1.0, 1.0], radius = 0.1 } }, smoke = 1.0 } }
+
+[solids.layer]
+shape = { box = { origin = [0.0, 0.0], size = [1.0, 0.5], cells = [16, 8] } }
+density = 1200
+young = 1.0e5
+poisson = 0.3
+supports = [
+    { where = "bottom", fix = ["x", "y"], velocity = { x = "sin(t)" } },
+    { where = { box = { origin = [0.0, 0.0], size = [0.1, 0.5] } }, fix = ["x"] },
+]
+[solids.layer.initial]
+velocity = ["0.0", "1e-3*sin(pi*y)"]
+
+[obstacles.floor]
+shape = { halfspace = { point = [0.0, 0.0], normal = [0.0, 1.0] } }
+
+[probes.top]
+of = "layer"
+at = [0.5, 0.5]
+quantity = "displacement"
+
+[probes.gauge]
+of = "fluid"
+at = [0.5, 1.5]
+quantity = "smoke"
+
+[output]
+every = 0.05
+"""
+
+BALLOON = """
+dim = 3
+[time]
+end = 1.0
+dt = 0.1
+[fluid]
+density = 1.0
+origin = [0.0, 0.0, 0.0]
+size = [1.0, 1.0, 1.0]
+cells = [8, 8, 8]
+[fluid.sides]
+back = "periodic"
+front = "periodic"
+[solids.shell]
+density = 1000.0
+young = 1e4
+poisson = 0.4
+interior = "void"
+[solids.shell.shape.box]
+origin = [0.2, 0.2, 0.2]
+size = [0.6, 0.6, 0.6]
+cells = [6, 6, 6]
+[solids.shell.shape.cavity]
+origin = [0.3, 0.3, 0.3]
+size = [0.4, 0.4, 0.4]
+[obstacles.pipe]
+shape = { cylinder = { start = [0.0, 0.0, 0.0], end = [1.0, 0.0, 0.0], radius = 0.05 } }
+outside = true
+"""
+
+
+def layer(*sets: str) -> dict:
+    data = tomllib.loads(LAYER)
+    for setting in sets:
+        apply_set(data, setting)
+    return data
+
+
+def balloon(*sets: str) -> dict:
+    data = tomllib.loads(BALLOON)
+    for setting in sets:
+        apply_set(data, setting)
+    return data
+
+
+def mistakes(data: dict, directory: Path | str = ".") -> list[str]:
+    """Return the lines of the report, without its heading."""
+    with pytest.raises(InputError) as caught:
+        scene_from_dict(data, directory)
+    assert caught.value.exit_code == 2
+    heading, *lines = str(caught.value).splitlines()
+    assert heading == ("scene: one mistake" if len(lines) == 1 else f"scene: {len(lines)} mistakes")
+    return [line.removeprefix("  ") for line in lines]
+
+
+def without(data: dict, *keys: str) -> dict:
+    for key in keys:
+        *tables, name = key.split(".")
+        table = data
+        for part in tables:
+            table = table[part]
+        del table[name]
+    return data
+
+
+BOX = "{ origin = [0.0, 0.0], size = [1.0, 1.0] }"
+
+#: Settings laid over a sound scene, the key that is wrong then, and words of what is allowed.
+BROKEN = [
+    # one value at a time
+    (["dim=4"], "dim = 4", "must be 2 or 3"),
+    (["dim=true"], "dim = true", "must be 2 or 3"),
+    (["time.dt=0"], "time.dt = 0", "must be greater than 0 (s)"),
+    (["time.dt=nan"], "time.dt = nan", "(s)"),
+    (["time.end='2'"], 'time.end = "2"', "must be a number (s)"),
+    (["time.integrator=bdf9"], 'time.integrator = "bdf9"', "must be 'newmark'"),
+    (["fluid=3"], "fluid = 3", "must be a table"),
+    (["fluid.density=-1"], "fluid.density = -1", "must be greater than 0 (kg/m^3)"),
+    (["fluid.density=true"], "fluid.density = true", "must be a number (kg/m^3)"),
+    (["fluid.viscosity=0.1"], "fluid.viscosity = 0.1", "must be 0: this version solves inviscid fluids"),
+    (["fluid.kind=lbm"], 'fluid.kind = "lbm"', "must be 'mac'"),
+    (["fluid.cells=[32, 0]"], "fluid.cells.1 = 0", "must be 1 or more"),
+    (["fluid.cells=[32, 6.5]"], "fluid.cells.1 = 6.5", "must be a whole number"),
+    (["fluid.cells=64"], "fluid.cells = 64", "must be a list"),
+    (["fluid.origin=['a', 0.0]"], 'fluid.origin.0 = "a"', "must be a number"),
+    (["fluid.sides.top=opn"], 'fluid.sides.top = "opn"', "must be 'slip', 'open' or 'periodic' (or { inflow"),
+    (["fluid.sides.top={}"], "fluid.sides.top.inflow", "is missing"),
+    (["fluid.sides.right.inflow.rest=shut"], 'inflow.rest = "shut"', "must be 'slip' or 'open'"),
+    (["fluid.sides.right.inflow.ramp=-1"], "fluid.sides.right.inflow.ramp = -1", "must be 0 or more (s"),
+    (["solids.layer.poisson=0.5"], "solids.layer.poisson = 0.5", "must be less than 0.5"),
+    (["solids.layer.young=0"], "solids.layer.young = 0", "must be greater than 0 (Pa)"),
+    (["solids.layer.material=jelly"], 'material = "jelly"', "must be 'green'"),
+    (["solids.layer.interior=air"], 'interior = "air"', "must be 'fluid' or 'void'"),
+    (["solids.layer.supports.0.fix=[]"], "solids.layer.supports.0.fix = []", "must not be empty"),
+    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "must be 'x', 'y' or 'z'"),
+    (["solids.layer.supports.0.velocity={w = 1.0}"], "solids.layer.supports.0.velocity.w", "must be 'x', 'y' or 'z'"),
+    (
+        ["solids.layer.supports.0.where=under"],
+        'where = "under"',
+        "'bottom', 'top', 'back', 'front' or 'all' (or a shape",
+    ),
+    (["obstacles.floor.outside='yes'"], 'obstacles.floor.outside = "yes"', "must be true or false"),
+    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'displacement', 'velocity', 'pressure' or"),
+    (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
+    (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
+    (["coupling.quadrature=9"], "coupling.quadrature = 9", "must be 4 or less"),
+    (["title=3"], "title = 3", "must be a text in quotes"),
+    (["gravity.0=true"], "gravity.0 = true", "must be a number or an expression in quotes (m/s^2"),
+    (["gravity.0=inf"], "gravity.0 = inf", "must be a finite number"),
+    (["gravity.0=2020-01-01"], "gravity.0", "must be a number or an expression"),
+    # unknown keys
+    (["fluid.viscocity=0"], "fluid.viscocity = 0", "no setting 'viscocity'; did you mean 'viscosity' (Pa s)?"),
+    (["outptu.every=1.0"], "outptu", "no setting 'outptu'; did you mean 'output'?"),
+    (["solids.layer.youngs=1.0"], "solids.layer.youngs = 1.0", "did you mean 'young' (Pa)?"),
+    (["solids.layer.shape.box.cell=[1]"], "solids.layer.shape.box.cell", "did you mean 'cells'?"),
+    (["fluid.gravity=[0.0]"], "fluid.gravity", "it stands at the top of the scene"),
+    (["fluid.dt=0.1"], "fluid.dt = 0.1", "did you mean 'time.dt'?"),
+    (["fluid.sides.right.inflow.young=1.0"], "young = 1.0", "did you mean 'solids.<name>.young'?"),
+    (["output.qqq=1"], "output.qqq = 1", "known here are every"),
+    # lengths and sizes
+    (["gravity=[0.0]"], "gravity = [0.0]", "must have 2 items, as dim = 2"),
+    (["fluid.size=[1.0, 2.0, 3.0]"], "fluid.size = [1.0, 2.0, 3.0]", "must have 2 items"),
+    (["fluid.size=[1.0, 0.0]"], "fluid.size = [1.0, 0.0]", "must be greater than 0 along every axis (m)"),
+    (["fluid.cells=[8]"], "fluid.cells = [8]", "must have 2 items"),
+    (["fluid.cells=[100000, 100000]"], "fluid.cells", "make more than 2147483647 cells"),
+    (["fluid.initial.velocity=[0.0]"], "fluid.initial.velocity = [0.0]", "must have 2 items"),
+    (["solids.layer.initial.velocity=[0.0]"], "solids.layer.initial.velocity = [0.0]", "must have 2 items"),
+    (["solids.layer.shape.box.size=[1.0, -0.5]"], "solids.layer.shape.box.size", "greater than 0 along every axis"),
+    (["probes.top.at=[0.5]"], "probes.top.at = [0.5]", "must have 2 items"),
+    # time
+    (["time.dt=3.0"], "time.dt = 3.0", "must not exceed time.end = 2 s"),
+    (["time.dt=1e-10"], "time.dt = 1e-10", "makes 2e+10 steps"),
+    (["time.dt=1e-320"], "time.dt", "steps to time.end = 2 s; at most 1e+08 may be"),
+    # sides
+    (["fluid.sides.left=periodic"], 'fluid.sides.left = "periodic"', "the opposite side 'right' must be periodic too"),
+    (["fluid.sides.bottom=periodic"], "fluid.sides.bottom", "the opposite side 'top' must be periodic too"),
+    (["fluid.sides.back=slip"], "fluid.sides.back", "bounds z, which dim = 2 does not have"),
+    (["fluid.sides.right.inflow.region={mesh='a.stl'}"], "inflow.region.mesh", "must be a box, ball, cylinder or half"),
+    (["fluid.sides.right.inflow.speed='-q'"], 'inflow.speed = "-q"', "unknown name 'q'; known are x, y, t, pi, e"),
+    # shapes
+    (["solids.layer.shape={}"], "solids.layer.shape", "must have exactly one of box, ball, cylinder"),
+    (["solids.layer.shape.mesh='a.msh'"], 'solids.layer.shape = "box, mesh"', "must have exactly one of"),
+    ([f"solids.layer.shape.box={BOX}"], "solids.layer.shape.box.cells", "is missing; a solid's box needs"),
+    (["solids.layer.shape={ball = {centre = [0.5, 0.5], radius = 0.1}}"], "shape.ball", "a solid must be meshed"),
+    (["solids.layer.shape={mesh='missing.msh'}"], "solids.layer.shape.mesh", "no such file"),
+    (["solids.layer.shape.scale=2.0"], "solids.layer.shape.scale = 2.0", "belongs to a mesh file only"),
+    (["solids.layer.shape.translate=[0.0, 0.0]"], "solids.layer.shape.translate", "belongs to a mesh file only"),
+    (
+        ["solids.layer.shape.box.origin=[0.5, 0.0]"],
+        'shape.box = "x from 0.5 to 1.5 m"',
+        "inside the fluid's grid, 0 to 1",
+    ),
+    (
+        [
+            "solids.two={shape = {box = {origin = [0.5, 0.2], size = [0.1, 0.1], cells = [2, 2]}}, density = 1.0, "
+            "young = 1.0, poisson = 0.0}"
+        ],
+        "solids.two.shape.box",
+        "overlaps solids.layer; bodies must lie apart",
+    ),
+    (["obstacles.floor.shape.halfspace.normal=[0.0, 0.0]"], "halfspace.normal = [0.0, 0.0]", "must not be zero"),
+    (
+        ["obstacles.floor.shape={cylinder = {start = [0.0, 0.0], end = [1.0, 0.0], radius = 0.1}}"],
+        "obstacles.floor.shape.cylinder",
+        "a cylinder needs dim = 3; in 2D use ball",
+    ),
+    (
+        ["obstacles.floor.shape={box = {origin = [0.0, 0.0], size = [1.0, 1.0], cells = [2, 2]}}"],
+        "obstacles.floor.shape.box.cells = [2, 2]",
+        "only a solid's box is meshed",
+    ),
+    ([f"obstacles.floor.shape.cavity={BOX}"], "obstacles.floor.shape.cavity", "only a solid's box can have a cavity"),
+    (["obstacles.floor.shape={mesh='missing.stl'}"], "obstacles.floor.shape.mesh", "no such file"),
+    (
+        ["solids.layer.shape.cavity={origin = [0.0, 0.0], size = [0.01, 0.01]}"],
+        "solids.layer.shape.cavity",
+        "holds no cell's centre",
+    ),
+    ([f"solids.layer.shape.cavity={BOX}"], "solids.layer.shape.cavity", "holds every cell's centre"),
+    # supports
+    (["solids.layer.supports.0.fix=['x', 'z']", "solids.layer.supports.0.where=top"], "supports.0.fix", "out of x, y"),
+    (["solids.layer.supports.0.fix=['x', 'x']"], "solids.layer.supports.0.fix", "names an axis twice"),
+    (["solids.layer.supports.0.where=front"], "solids.layer.supports.0.where", "bounds z"),
+    (
+        ["solids.layer.supports.1.velocity.y=1.0"],
+        "supports.1.velocity.y = 1.0",
+        "belongs to fixed axes only; fix = ['x']",
+    ),
+    (["solids.layer.supports.0.where={mesh='a.stl'}"], "supports.0.where.mesh", "must be a box, ball"),
+    # names and probes
+    (["probes.9a={of='fluid', at=[0.5, 1.0], quantity='pressure'}"], "probes.9a", "a name must be made of letters"),
+    (["solids.a-b=1"], "solids.a-b = 1", "must be a table"),
+    (["probes.time={of='fluid', at=[0.5, 1.0], quantity='pressure'}"], "probes.time", "is a column of history.csv"),
+    (["probes.top.of=lyer"], 'probes.top.of = "lyer"', "must be one of fluid, layer"),
+    (["probes.top.quantity=pressure"], 'probes.top.quantity = "pressure"', "a solid has displacement and velocity"),
+    (["probes.gauge.quantity=displacement"], "probes.gauge.quantity", "a fluid has velocity, pressure and smoke"),
+    (["probes.gauge.at=[0.5, 2.5]"], "probes.gauge.at = [0.5, 2.5]", "y must lie inside the fluid's grid, 0 to 2 m"),
+    # expressions
+    (["gravity.1='9.81*x'"], 'gravity.1 = "9.81*x"', "unknown name 'x'; known are t, pi, e"),
+    (["fluid.smoke.initial='t'"], 'fluid.smoke.initial = "t"', "known are x, y, pi, e"),
+    (["solids.layer.initial.velocity.1='sin(z)'"], 'initial.velocity.1 = "sin(z)"', "unknown name 'z'"),
+    (["solids.layer.supports.0.velocity.x='import os'"], "supports.0.velocity.x", "is not an expression; allowed are"),
+]
+
+
+@pytest.mark.parametrize("sets, key, allowed", BROKEN, ids=lambda value: value[0] if isinstance(value, list) else "")
+def test_a_mistake_is_reported_once_with_its_key_its_value_and_what_is_allowed(sets, key, allowed):
+    lines = mistakes(layer(*sets))
+    assert len(lines) == 1, lines
+    assert key in lines[0] and allowed in lines[0], lines[0]
+
+
+@pytest.mark.parametrize(
+    "data, key, allowed",
+    [
+        (without(layer(), "time"), "time", "is missing"),
+        (without(layer(), "fluid.density"), "fluid.density", "is missing (kg/m^3)"),
+        (without(layer(), "fluid.smoke", "probes.gauge"), "fluid.sides.right.inflow.smoke = 1.0", "[fluid.smoke]"),
+        (without(layer(), "gravity"), "fluid.smoke.buoyancy = 0.5", "set gravity too"),
+        (
+            without(layer(), "fluid", "solids", "probes", "obstacles"),
+            "fluid",
+            "needs a [fluid], or at least one [solids",
+        ),
+        (without(layer(), "fluid", "probes.gauge"), 'obstacles = "floor"', "only a fluid feels obstacles"),
+        (without(layer(), "fluid", "obstacles"), 'probes.gauge.of = "fluid"', "no [fluid], only layer"),
+        (without(layer("fluid.sides.top=slip"), "solids", "probes.top"), "fluid.sides.right.inflow", "able to leave"),
+        (without(layer("fluid.smoke.buoyancy=0.0", "fluid.sides.right=slip"), "fluid.smoke"), "probes.gauge", "smoke"),
+        (balloon("obstacles.pipe.shape.cylinder.end=[0.0, 0.0, 0.0]"), "cylinder.end", "must differ from start"),
+        (balloon("solids.shell.shape.box.cells=[6, 6]"), "solids.shell.shape.box.cells", "must have 3 items"),
+        (balloon("solids.shell.shape.cavity.cells=[1, 1, 1]"), "cavity.cells", "leave cells out"),
+        (balloon("fluid.sides.front=open"), "fluid.sides.back", "the opposite side 'front'"),
+        (balloon("solids.shell.shape.box.origin.2=0.5"), "z from 0.5 to 1.1 m", "z must lie inside"),
+        (balloon("solids.fluid={}"), "solids.fluid.shape", "is missing"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_missing_or_does_not_fit_together_is_named(data, key, allowed):
+    lines = mistakes(data)
+    assert any(key in line and allowed in line for line in lines), lines
+
+
+def test_a_solid_cannot_be_called_fluid():
+    data = layer()
+    data["solids"]["fluid"] = data["solids"].pop("layer")
+    lines = mistakes(data)
+    assert "solids.fluid: the name 'fluid' means the fluid; call the solid something else" in lines
+
+
+@pytest.mark.parametrize("name", RESERVED_PROBES)
+def test_a_probe_cannot_take_a_column_of_the_history(name):
+    assert name in mistakes(layer(f"probes.{name}={{of='fluid', at=[0.5, 1.0], quantity='pressure'}}"))[0]
+
+
+def test_all_mistakes_stand_together_whatever_finds_them():
+    lines = mistakes(
+        layer(
+            "fluid.viscocity=0",
+            "time.dt=-1",
+            "solids.layer.young=soft",
+            "solids.layer.supports.0.velocity.x='sine(t)'",
+            "solids.layer.supports.0.fix=['x', 'z']",
+            "probes.top.of=lyer",
+            "gravity=[0.0]",
+        )
+    )
+    keys = [line.split(" ")[0] for line in lines]
+    assert keys == [
+        "time.dt",
+        "fluid.viscocity",
+        "solids.layer.young",
+        "solids.layer.supports.0.fix",
+        "probes.top.of",
+        "gravity",
+        "solids.layer.supports.0.velocity.x",
+    ]
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ["fluid.size=3"],  # whether the layer lies in the grid cannot be said
+        ["fluid.origin.1=a"],
+        ["solids.layer.shape.box.origin=[0.5, true]"],
+        ["probes.top.of=3"],
+        ["solids.layer.supports.0.fix=['q']"],
+        ["dim=5"],
+    ],
+)
+def test_a_mistake_draws_no_others_after_it(sets):
+    assert len(mistakes(layer(*sets))) == 1
+
+
+def test_a_report_fits_on_a_screen():
+    data = layer(*(f"fluid.nonsense{n}=1" for n in range(60)))
+    with pytest.raises(InputError) as caught:
+        scene_from_dict(data)
+    lines = str(caught.value).splitlines()
+    assert lines[0] == "scene: 60 mistakes" and lines[-1] == "  and 20 more" and len(lines) == 42
+    long = mistakes(layer(f"time.integrator={'x' * 500}"))[0]
+    assert len(long) < 120
+
+
+VALUES = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=8),
+    st.lists(st.floats(), max_size=4),
+    st.dictionaries(st.sampled_from(["box", "inflow", "origin", "velocity", "end"]), st.integers(), max_size=2),
+)
+
+
+def leaves(data, path=()):
+    yield path
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ():
+        yield from leaves(value, (*path, key))
+
+
+PATHS = [path for path in leaves(tomllib.loads(LAYER)) if path]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(PATHS), VALUES), min_size=1, max_size=3))
+def test_any_scene_is_read_or_refused_with_input_error(changes):
+    data = copy.deepcopy(tomllib.loads(LAYER))
+    for path, value in changes:
+        table = data
+        try:
+            for part in path[:-1]:
+                table = table[part]
+            table[path[-1]] = value
+        except (KeyError, IndexError, TypeError):
+            continue
+    try:
+        scene_from_dict(data)
+    except InputError as error:
+        assert error.exit_code == 2 and "mistake" in str(error)
+
+
+# ---- reading and writing ------------------------------------------------------------------------------------
+
+
+def written(folder: Path, text: str = LAYER) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("text", [LAYER, BALLOON], ids=["2D", "3D"])
+def test_a_dumped_scene_is_the_scene(tmp_path, text):
+    scene = load_scene(written(tmp_path, text))
+    again = load_scene(written(tmp_path, dump_scene(scene)))
+    assert again == scene
+    assert dump_scene(again) == dump_scene(scene)
+
+
+def test_a_dumped_scene_names_every_setting():
+    data = tomllib.loads(dump_scene(scene_from_dict(layer())))
+    assert data["time"]["integrator"] == "newmark" and data["checkpoint"]["keep"] == 3
+    assert data["fluid"]["sides"]["left"] == "slip" and "back" not in data["fluid"]["sides"]
+    assert data["solids"]["layer"]["damping"] == {"mass": 0.0, "stiffness": 0.0}
+    assert data["solids"]["layer"]["density"] == 1200.0
+    assert "scale" not in str(data)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(st.characters(exclude_categories=["Cs"])), st.floats(1e-300, 1e300), st.integers(1, 10**6))
+def test_texts_and_numbers_survive_toml(title, density, cells):
+    data = layer()
+    data["title"], data["fluid"]["density"], data["fluid"]["cells"] = title, density, [cells, 1]
+    scene = scene_from_dict(data)
+    assert scene_from_dict(tomllib.loads(dump_scene(scene))) == scene
+
+
+def test_a_mesh_is_found_from_the_scene_and_from_its_copy(tmp_path, monkeypatch):
+    folder, elsewhere = tmp_path / "case", tmp_path / "run"
+    (folder / "meshes").mkdir(parents=True)
+    elsewhere.mkdir()
+    mesh = folder / "meshes" / "bunny.msh"
+    mesh.write_text("")
+    text = LAYER.replace("{ box = { origin = [0.0, 0.0], size = [1.0, 0.5], cells = [16, 8] } }", '{ mesh = "M" }')
+    monkeypatch.chdir(tmp_path)
+    scene = load_scene(written(folder, text.replace('"M"', '"meshes/bunny.msh"')).relative_to(tmp_path))
+    assert scene.directory == Path("case")
+    assert scene.solids["layer"].shape.mesh == str(mesh)
+    monkeypatch.chdir(elsewhere)
+    copied = load_scene(written(elsewhere, dump_scene(scene)))
+    assert copied == scene and copied.directory == elsewhere
+
+
+def test_a_scene_travels_between_ranks(tmp_path):
+    scene = load_scene(written(tmp_path))
+    again = pickle.loads(pickle.dumps(scene))
+    assert again == scene and again.directory == tmp_path
+
+
+def test_a_change_makes_another_scene():
+    assert scene_from_dict(layer()) != scene_from_dict(layer("time.dt=0.02"))
+    assert scene_from_dict(layer()) != "scene"
+
+
+def test_what_one_reads_is_left_as_it_was():
+    data = layer()
+    before = copy.deepcopy(data)
+    with pytest.raises(InputError):
+        scene_from_dict({**data, "dim": 9})
+    scene_from_dict(data)
+    assert data == before
+
+
+@pytest.mark.parametrize(
+    "content, said",
+    [
+        (b"dim = ", "not valid TOML: Invalid value"),
+        (b"\xff\xfe", "is not UTF-8 text (byte 0)"),
+        (b"dim = 2\ndim = 3\n", "not valid TOML: Cannot overwrite a value (at line 2"),
+        (b"a = " + b"[" * 5000, "not valid TOML"),
+        (b"", "3 mistakes"),
+    ],
+)
+def test_a_file_that_is_no_scene_is_refused(tmp_path, content, said):
+    path = tmp_path / "scene.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    assert str(path) in str(caught.value) and said in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file; a scene is a TOML file"):
+        load_scene(tmp_path / "scene.toml")
+    with pytest.raises(InputError, match="is a folder"):
+        load_scene(tmp_path)
+
+
+# ---- --set --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [
+        ("1e-3", 1e-3),
+        ("7", 7),
+        ("true", True),
+        ("[1, 2.5]", [1, 2.5]),
+        ('"0.5"', "0.5"),
+        ("mac", "mac"),
+        ("-9.81*t", "-9.81*t"),
+        ("{ a = 1 }", {"a": 1}),
+        ("", ""),
+        ("1\nb = 2", "1\nb = 2"),
+        ("[" * 3000, "[" * 3000),
+    ],
+)
+def test_a_set_value_is_toml_or_else_text(text, value):
+    assert parse_value(text) == value and type(parse_value(text)) is type(value)
+
+
+def test_set_reaches_every_leaf(tmp_path):
+    sets = ["time.dt=0.02", "solids.layer.supports.1.fix.0=y", "gravity.1 = -1", "checkpoint.every=0.5", "title=a=b"]
+    scene = load_scene(written(tmp_path), sets)
+    assert scene.time.dt == 0.02 and scene.gravity == [0.0, -1.0] and scene.checkpoint.every == 0.5
+    assert scene.solids["layer"].supports[1].fix == ["y"] and scene.title == "a=b"
+
+
+@pytest.mark.parametrize(
+    "setting, said",
+    [
+        ("time.dt", "must be key=value, such as --set time.dt=0.01"),
+        ("=3", "must be key=value"),
+        ("time..dt=3", "must be key=value"),
+        ("gravity.2=3", "gravity is a list; its items are numbered 0 to 1"),
+        ("gravity.-1=3", "gravity is a list; its items are numbered 0 to 1"),
+        ("gravity.x=3", "gravity is a list"),
+        ("time.dt.x=3", "time.dt is 0.01, not a table"),
+    ],
+)
+def test_a_setting_without_a_place_is_refused(tmp_path, setting, said):
+    with pytest.raises(InputError) as caught:
+        load_scene(written(tmp_path), [setting])
+    assert f"--set {setting}: " in str(caught.value) and said in str(caught.value)
+
+
+def test_a_resumed_run_may_change_when_it_ends_and_what_it_writes(tmp_path):
+    path = written(tmp_path)
+    scene = load_scene(path, ["time.end=3.0", "output.every=0.1", "checkpoint.keep=1"], only=RESUMABLE)
+    assert (scene.time.end, scene.output.every, scene.checkpoint.keep) == (3.0, 0.1, 1)
+    for setting in ("time.dt=0.1", "time={}", "outputs.every=1", "solids.layer.young=1"):
+        with pytest.raises(InputError, match="here only time.end, output, checkpoint may be changed"):
+            load_scene(path, [setting], only=RESUMABLE)
+
+
+# ---- what the rest reads ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "end, dt, steps", [(2.0, 0.01, 200), (0.3, 0.1, 3), (1.0, 0.3, 4), (0.1, 0.1, 1), (1.0, 1e-6, 10**6), (0.7, 0.1, 7)]
+)
+def test_steps_reach_the_end_and_round_off_adds_none(end, dt, steps):
+    assert scene_from_dict(layer(f"time.end={end}", f"time.dt={dt}")).time.steps == steps
+
+
+def test_a_mesh_outside_the_grid_is_refused():
+    scene = scene_from_dict(layer())
+    check_inside_grid(scene, "solids.bunny.shape", np.array([[0.0, 0.0], [1.0 + 1e-12, 2.0]]))
+    with pytest.raises(InputError, match=r'solids.bunny.shape = "y from 0.5 to 2.5 m": y must lie inside'):
+        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, 2.5]]))
+    dry = without(layer(), "fluid", "obstacles", "probes.gauge")
+    check_inside_grid(scene_from_dict(dry), "solids.bunny.shape", np.array([[9.0, 9.0]]))
+
+
+def test_every_expression_of_a_scene_is_found():
+    assert [key for key, _, _ in expressions(scene_from_dict(layer("fluid.initial.velocity=[0, 'x']")))] == [
+        "gravity.0",
+        "gravity.1",
+        "fluid.initial.velocity.0",
+        "fluid.initial.velocity.1",
+        "fluid.smoke.initial",
+        "fluid.sides.right.inflow.speed",
+        "solids.layer.initial.velocity.0",
+        "solids.layer.initial.velocity.1",
+        "solids.layer.supports.0.velocity.x",
+    ]
+
+
+def test_a_scene_cannot_be_changed():
+    scene = scene_from_dict(layer())
+    with pytest.raises(ValueError, match="frozen"):
+        scene.time.dt = 1.0
+    assert isinstance(scene, Scene)
