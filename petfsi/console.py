@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+#: What MPI launchers tell a process; Open MPI's gives rank 0 a terminal of its own, wherever its output goes.
+LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK", "MV2_COMM_WORLD_SIZE")
+
+
+def _is_launched() -> bool:
+    return any(name in os.environ for name in LAUNCHERS)
 
 
 class Console:
     """Rank 0's voice; on other ranks every call does nothing. Not collective.
 
-    On a terminal a bar shows the step and the rest stands above it; elsewhere, in a batch log, each step is a line.
-    ``log_path`` gets every line, always; it is appended to, so that a resumed run continues it.
+    On a terminal a bar shows the step and the rest stands above it; elsewhere, in a batch log or under an MPI
+    launcher, each step is a line. ``log_path`` gets every line, always; it is appended to, so that a resumed run
+    continues it. Neither a full disk nor a reader who has left ends the run here: other files tell of the first.
 
     Parameters
     ----------
@@ -29,14 +39,14 @@ class Console:
 
     def __init__(self, rank: int, log_path: Path | None = None, total: int | None = None) -> None:
         self._speaks = rank == 0
-        self._log: IO[str] | None = None
+        self._log: int | None = None
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         if not self._speaks:
             return
         if log_path is not None:
-            self._log = open(log_path, "a", encoding="utf-8")
-        if sys.stdout.isatty():
+            self._log = os.open(log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        if sys.stdout.isatty() and not _is_launched():
             self._start_bar(total)
 
     def _start_bar(self, total: int | None) -> None:
@@ -70,10 +80,17 @@ class Console:
         if shown and self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         elif shown:
-            print(line, flush=True)
+            self._print(line)
         if self._log is not None:
-            self._log.write(line + "\n")
-            self._log.flush()  # a killed run must leave its last words
+            with suppress(OSError):  # unbuffered: a killed run leaves its last words
+                os.write(self._log, (line + "\n").encode())
+
+    def _print(self, line: str) -> None:
+        try:
+            print(line, flush=True)
+        except BrokenPipeError:
+            # what is left in the buffer would be tried again, and complained of, when Python ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def close(self) -> None:
         """Take the bar down and close the log."""
@@ -81,7 +98,7 @@ class Console:
             self._bar.stop()
             self._bar = None
         if self._log is not None:
-            self._log.close()
+            os.close(self._log)
             self._log = None
 
     def __enter__(self) -> Console:

@@ -26,8 +26,8 @@ class Layout:
     @classmethod
     def of(cls, comm: MPI.Comm, n_local: int) -> Layout:
         """Return the layout in which this rank holds ``n_local`` entries. Collective."""
-        end = comm.scan(n_local)
-        return cls(n_local, end - n_local, comm.allreduce(n_local))
+        counts = comm.allgather(n_local)
+        return cls(n_local, sum(counts[: comm.rank]), sum(counts))
 
     @property
     def end(self) -> int:
@@ -167,7 +167,7 @@ def reason_name(ksp: PETSc.KSP) -> str:
     return (failures or names or [str(reason)])[0]
 
 
-def null_space(comm: MPI.Comm, like: PETSc.Vec, vectors: list[np.ndarray]) -> PETSc.NullSpace:
+def null_space(like: PETSc.Vec, vectors: list[np.ndarray]) -> PETSc.NullSpace:
     """Return the null space spanned by vectors without common support, given by their local parts. Collective."""
     basis = []
     for values in vectors:
@@ -175,4 +175,4 @@ def null_space(comm: MPI.Comm, like: PETSc.Vec, vectors: list[np.ndarray]) -> PE
         vec.array = values
         vec.normalize()
         basis.append(vec)
-    return PETSc.NullSpace().create(constant=False, vectors=basis, comm=comm)
+    return PETSc.NullSpace().create(constant=False, vectors=basis, comm=like.comm)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 
@@ -12,8 +13,7 @@ import numpy as np
 
 from petfsi import __version__
 from petfsi.errors import InputError
-from petfsi.scene.checks import check_inside_grid
-from petfsi.scene.schema import Scene
+from petfsi.scene.schema import Scene, Solid
 
 #: The options file in force when none is named.
 DEFAULT_OPTIONS = "monolithic.opts"
@@ -118,33 +118,35 @@ def _count(end: float, every: float) -> int:
 
 
 def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
-    """Return nodes and cells of each solid; meshes from files are read and judged, obstacles' surfaces too."""
-    nodes, cells, errors = {}, {}, []
-    for name, solid in scene.solids.items():
-        box = solid.shape.box
-        if box is not None and box.cells is not None and solid.shape.cavity is None:
-            nodes[name] = math.prod(n + 1 for n in box.cells)
-            cells[name] = math.prod(box.cells) * math.factorial(scene.dim)
-            continue
-        from petfsi.geometry.meshes import build_mesh
+    """Return nodes and cells of each solid; where counting is not enough the meshes are built and judged."""
+    if all(_is_plain(solid) for solid in scene.solids.values()) and not scene.obstacles:
+        boxes = {name: solid.shape.box.cells for name, solid in scene.solids.items()}
+        nodes = {name: math.prod(n + 1 for n in box) for name, box in boxes.items()}
+        return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
+    from petfsi.geometry.bodies import build_bodies
+    from petfsi.geometry.meshes import read_surface
 
+    errors, meshes = [], {}
+    readers: list[Callable[[], object]] = [
+        partial(read_surface, obstacle.shape, scene.dim, f"obstacles.{name}.shape", scene.directory)
+        for name, obstacle in scene.obstacles.items()
+        if obstacle.shape.mesh is not None
+    ]
+    for read in [lambda: meshes.update(build_bodies(scene)), *readers]:
         try:
-            points, simplices = build_mesh(solid, scene.dim, f"solids.{name}", scene.directory)
-            check_inside_grid(scene, f"solids.{name}.shape", points)
-            nodes[name], cells[name] = len(points), len(simplices)
+            read()
         except InputError as error:
-            errors.append(str(error))
-    for name, obstacle in scene.obstacles.items():
-        if obstacle.shape.mesh is not None:
-            from petfsi.geometry.meshes import read_surface
-
-            try:
-                read_surface(obstacle.shape, scene.dim, f"obstacles.{name}.shape", scene.directory)
-            except InputError as error:
-                errors.append(str(error))
+            errors += [line for line in str(error).splitlines() if line not in errors]
     if errors:
         raise InputError("\n".join(errors))
-    return nodes, cells
+    return {n: len(points) for n, (points, _) in meshes.items()}, {n: len(cells) for n, (_, cells) in meshes.items()}
+
+
+def _is_plain(solid: Solid) -> bool:
+    """Return whether nothing about a solid can be wrong that the scene alone does not show."""
+    shape = solid.shape
+    named = all(isinstance(support.where, str) for support in solid.supports)
+    return shape.box is not None and shape.box.cells is not None and shape.cavity is None and named
 
 
 def _state_bytes(scene: Scene, nodes: int, cells: int) -> float:

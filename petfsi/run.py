@@ -94,12 +94,19 @@ class Run:
                 self._slowest = max(self._slowest, clock.perf_counter() - begin)
                 outcome = simulation.outcome
                 self.console.step(
-                    simulation.step, simulation.time, simulation.dt, outcome.iterations, outcome.residual, clock.perf_counter() - begin
+                    simulation.step,
+                    simulation.time,
+                    simulation.dt,
+                    outcome.iterations,
+                    outcome.residual,
+                    clock.perf_counter() - begin,
                 )
                 why = stop.asked(self._slowest) if simulation.step < last else ""
                 if why:
                     self.checkpoint()
-                    self.console.note(f"stopped by {why} after step {simulation.step}; go on with: petfsi resume {self.files.path}")
+                    self.console.note(
+                        f"stopped by {why} after step {simulation.step}; go on with: petfsi resume {self.files.path}"
+                    )
                     self.summarise("stopped")
                     return STOPPED
         except SolveError as error:
@@ -185,14 +192,16 @@ class Run:
 
     def _story(self, error: SolveError) -> str:
         simulation = self.simulation
-        last = f"Last good checkpoint: {self.last_checkpoint}." if self.last_checkpoint else "There is no checkpoint yet."
+        last = (
+            f"Last good checkpoint: {self.last_checkpoint}." if self.last_checkpoint else "There is no checkpoint yet."
+        )
         return f"step {simulation.step + 1}, t = {simulation.time + simulation.dt:.6g} s: {error}\n{last}"
 
 
 def _grid_info(simulation: Simulation) -> GridInfo | None:
-    if simulation.fluid is None:
+    grid = getattr(simulation.fluid, "grid", None)
+    if grid is None:
         return None
-    grid = simulation.fluid.grid
     return GridInfo(tuple(map(float, grid.origin)), tuple(map(float, grid.dx)), tuple(grid.cells[: grid.dim]))
 
 

@@ -9,9 +9,10 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build, petsc
+from petfsi import build
 from petfsi.errors import SolveError
-from petfsi.fields.base import Reader, Slab
+from petfsi.fields.base import FluidField, Reader, Slab, SolidField
+from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.solve import Outcome, Solver
 from petfsi.system import System
@@ -26,8 +27,6 @@ class Simulation:
     ----------
     step, time, dt : int, float, float
         The present step number, its time (s) and the step (s).
-    n_steps : int
-        The number of the last step.
     outcome : Outcome
         What the last solve reported.
     volume_error : float
@@ -42,20 +41,18 @@ class Simulation:
         self.scene = scene
         self.dt = scene.time.dt
         self.step = 0
-        self.n_steps = int(np.ceil(scene.time.end / self.dt - 1e-9))
         self.fields = build.build_fields(comm, scene)
         self.couplings = build.build_couplings(scene, self.fields)
-        by_name = {field.name: field for field in self.fields}
-        self.solid, self.fluid = by_name.get("solid"), by_name.get("pressure")
+        self.solid = next((field for field in self.fields if isinstance(field, SolidField)), None)
+        self.fluid = next((field for field in self.fields if isinstance(field, FluidField)), None)
         if self.solid and self.fluid:
-            self.solid.set_scale(self.fluid.density * self.fluid.grid.cell_volume)
+            self.solid.set_scale(self.fluid.density * self.fluid.cell_volume)
         self.system = System(comm, self.fields, self.couplings)
         self.solver = Solver(self.system)
+        self.regions = ClosedRegions(self.system, self.fluid, self.solver.decoupled) if self.fluid else None
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
-        self._regions: list[tuple[np.ndarray, float]] = []
-        self._null_space_of: tuple[int, ...] | None = None
 
     @property
     def time(self) -> float:
@@ -103,73 +100,35 @@ class Simulation:
         return self.solver.check_options()
 
     def _assemble(self, t: float, dt: float) -> bool:
-        for part in (*self.fields, *self.couplings):
-            part.assemble(t, dt)
+        for field in self.fields:
+            field.assemble(t, dt)
+        for coupling in self.couplings:
+            coupling.assemble(t, dt)
         changed = self.system.refresh()
-        if self.fluid:
-            self._find_closed_regions()
+        if self.regions:
+            self.regions.refresh()
         return changed
 
     def _accept(self, t: float, dt: float) -> None:
-        self._account_volume(dt)
+        self.volume_error = self.regions.volume_error(dt) if self.regions else 0.0
         values = dict(zip((field.name for field in self.fields), self.system.values(), strict=True))
         if self.solid:
-            self._check_speed(values["solid"])
+            self._check_speed(self.solid, values["solid"])
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
             coupling.accept(t, dt)
         if self.fluid:
             self.fluid.accept(values["pressure"], t, dt)
 
-    def _check_speed(self, velocity: np.ndarray) -> None:
+    def _check_speed(self, solid: SolidField, velocity: np.ndarray) -> None:
         """Raise if a node would cross the whole scene in one step: the state has blown up."""
         fastest = self.comm.allreduce(float(np.abs(velocity).max(initial=0.0)), MPI.MAX)
-        extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * self.solid.extent
+        extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
         if not fastest * self.dt < extent:
             raise SolveError(
                 f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
                 f"in one step of {self.dt:g} s. Take a smaller dt, more damping, or a monolithic options file."
             )
-
-    def _find_closed_regions(self) -> None:
-        """Tell PETSc which uniform pressures no equation sees.
-
-        A region closed by rigid walls leaves its mean pressure free. One that an elastic wall closes does not,
-        except to a pressure block that is inverted by itself.
-        """
-        fluid = self.fluid
-        version = (fluid.geometry_version, *(coupling.n_assembled for coupling in self.couplings))
-        if version == self._null_space_of:
-            return
-        self._null_space_of = version
-        touched = self.couplings[0].touched if self.couplings else None
-        regions = fluid.closed_regions(touched)
-        counts = self.comm.allreduce(np.array([indicator.sum() for indicator, _ in regions] or [0.0]))
-        self._regions = [
-            (indicator, float(n) * fluid.grid.cell_volume) for (indicator, _), n in zip(regions, counts, strict=False)
-        ]
-        free = [r for r, touches_solid in regions if self.solver.decoupled or not touches_solid]
-        self._attach_null_space(fluid.block, free)
-        if self.system.index_sets:
-            piece = self.system.piece("pressure")
-            rigid = [np.zeros(self.system.solution.local_size) for _, touches_solid in regions if not touches_solid]
-            for whole, indicator in zip(rigid, (r for r, touches in regions if not touches), strict=True):
-                whole[piece] = indicator
-            self._attach_null_space(self.system.operator, rigid)
-
-    def _attach_null_space(self, mat: petsc.PETSc.Mat, vectors: list[np.ndarray]) -> None:
-        space = petsc.null_space(self.comm, mat.createVecRight(), vectors)
-        mat.setNullSpace(space)
-        mat.setTransposeNullSpace(space)
-
-    def _account_volume(self, dt: float) -> None:
-        if not self._regions:
-            self.volume_error = 0.0
-            return
-        outflow = self.system.residual.array[self.system.piece("pressure")] / self.fluid.row_scale
-        sums = self.comm.allreduce(np.array([outflow @ indicator for indicator, _ in self._regions]))
-        volumes = np.array([volume for _, volume in self._regions])
-        self.volume_error = float(np.max(np.abs(sums) * dt / volumes))
 
     def probe_columns(self) -> list[str]:
         """Return the names of the probes' columns in history.csv."""
@@ -181,7 +140,9 @@ class Simulation:
 
     def _measure(self, of: str, at: list[float], quantity: str) -> np.ndarray | float:
         if of == "fluid":
+            assert self.fluid is not None  # the scene was checked
             return self.fluid.probe(quantity, at)
+        assert self.solid is not None
         return self.solid.probe(of, at, quantity)
 
     def _probe_values(self, measure: Callable) -> Iterator[tuple[str, float]]:
@@ -202,21 +163,6 @@ class Simulation:
             **{field.name: field.n_assembled for field in self.fields},
             **{"-".join(next(iter(coupling.blocks))): coupling.n_assembled for coupling in self.couplings},
         }
-
-    def skipped(self) -> list[str]:
-        """Return what this scene does without, and why."""
-        scene, out = self.scene, []
-        if not scene.solids:
-            out.append("solid, nest and coupling: the scene has no solids")
-        if scene.fluid is None:
-            out.append("fluid, nest and coupling: the scene has no fluid")
-        elif scene.fluid.smoke is None:
-            out.append("smoke: the fluid has no [fluid.smoke]")
-        if scene.fluid and scene.fluid.viscosity == 0:
-            out.append("viscous terms: viscosity is 0")
-        if scene.fluid and not scene.obstacles:
-            out.append("obstacles: the scene has none")
-        return out
 
     def state(self) -> dict[str, dict[str, Slab]]:
         """Return all that the next step reads, by field."""

@@ -61,7 +61,9 @@ def load_options(args: list[str], fields: list[str], base: Path | None = None) -
             rest.append(word)
     for path in files or [base or default]:
         shipped = options_directory() / path.name
-        petsc.insert_options_file(shipped if not path.exists() and path.parent == Path(".") and shipped.exists() else path)
+        petsc.insert_options_file(
+            shipped if not path.exists() and path.parent == Path(".") and shipped.exists() else path
+        )
     database = PETSc.Options()
     if len(fields) == 1 and not any(name.startswith(field_prefix(fields[0])) for name in database.getAll()):
         petsc.insert_options(_lines_with_prefix(default, field_prefix(fields[0])))
@@ -75,8 +77,9 @@ def _lines_with_prefix(path: Path, prefix: str) -> list[str]:
 
 def dump_options() -> str:
     """Return petfsi's options in force, as an options file."""
-    names = PETSc.Options().getAll()
-    return "".join(f"-{name} {value}".rstrip() + "\n" for name, value in sorted(names.items()) if name.startswith(PREFIX))
+    values = PETSc.Options().getAll()
+    lines = [f"-{name} {values[name] or ''}".rstrip() for name in sorted(values) if name.startswith(PREFIX)]
+    return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from petfsi.fields.mac.fluid import MacFluid
 from petfsi.scene.schema import Scene
 
 PERIODIC = {"left": "periodic", "right": "periodic", "bottom": "periodic", "top": "periodic"}
+BOX = {"shape": {"box": {"origin": [0.35, 0.3], "size": [0.3, 0.3]}}}
 
 
 def make_scene(cells, gravity=None, obstacles=None, **fluid):
@@ -84,3 +85,12 @@ def set_velocity(fluid, functions):
     """Set the velocity everywhere, ghosts included, from functions of x, y, z."""
     for axis, function in enumerate(functions):
         fluid.velocity[axis][...] = function(*fluid.grid.coordinates(axis))
+
+
+def solid_box(fluid, low, high):
+    """Return a cell mask that marks a box as SOLID, ghosts included."""
+    x = fluid.grid.coordinates(None)[: fluid.dim]
+    covered = np.ones(fluid.grid.shape(None), dtype=bool)
+    for line, a, b in zip(x, low, high, strict=True):
+        covered &= (line > a) & (line < b)
+    return covered.astype(np.uint8)

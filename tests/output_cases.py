@@ -1,8 +1,12 @@
 """Fields with known values, cut into slabs in whatever way, for the tests of what a run leaves on the disk."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from mpi4py import MPI
 
 from petfsi.fields.base import Slab
@@ -93,3 +97,25 @@ def solid_fields(dim: int, time: float) -> dict[str, np.ndarray]:
 def output(dim: int, time: float, comm: MPI.Comm) -> dict[str, dict[str, Slab]]:
     """Return what the fields of a run give for output."""
     return slabs({"pressure": grid_fields(grid(dim), time), "solid": solid_fields(dim, time)}, comm)
+
+
+PREAMBLE = """
+import resource, sys
+from pathlib import Path
+from mpi4py import MPI
+sys.path.insert(0, {tests!r})
+from output_cases import *
+from petfsi.errors import PetfsiError
+comm, directory = MPI.COMM_WORLD, Path({directory!r})
+"""
+
+
+def run_on(ranks: int, code: str, directory: Path) -> subprocess.CompletedProcess:
+    """Run code on so many ranks; it finds ``comm``, ``directory`` and all that stands above here."""
+    if MPI.COMM_WORLD.size > 1:
+        pytest.skip("mpirun does not start under mpirun")
+    text = PREAMBLE.format(tests=os.path.dirname(__file__), directory=str(directory)) + code
+    start = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
+    allow = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_"))} | allow
+    return subprocess.run([*start, sys.executable, "-c", text], capture_output=True, text=True, timeout=60, env=clean)

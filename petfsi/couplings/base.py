@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import numpy as np
 from petsc4py import PETSc
 
 
@@ -17,11 +18,14 @@ class Coupling(ABC):
         matrix objects for the whole run.
     pattern_version : int
         Grows whenever the pattern of a block changes; the same on all ranks.
+    touched : ndarray of bool or None
+        The fluid's cells that the coupling acts on, in the fluid's own arrangement; None is none.
     n_coupled, n_assembled : int
         How often the transfer operators were made and the blocks filled; a step that changes nothing adds nothing.
     """
 
     blocks: dict[tuple[str, str], PETSc.Mat]
+    touched: np.ndarray | None = None
     pattern_version: int = 0
     n_coupled: int = 0
     n_assembled: int = 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -12,10 +12,10 @@ from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
+from petfsi.fields.base import SolidField
 from petfsi.fields.mac.kinds import FLUID, SOLID, SOLID_FACE, VOID
 from petfsi.geometry import rays
-from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, Layout, gather_triplets, new_block, set_csr
+from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
@@ -24,25 +24,6 @@ if TYPE_CHECKING:
 
 #: This rank's rows of a matrix: indptr, global columns, values.
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-class HasSurface(Protocol):
-    """What the coupling asks of a solid; all arrays are the same on every rank."""
-
-    name: str
-    layout: Layout
-
-    def surface(self) -> Surface:
-        """Return the wet surface; it never changes."""
-
-    def surface_positions(self) -> np.ndarray:
-        """Return the present positions of its points, (n_points, dim)."""
-
-    def surface_velocity(self) -> np.ndarray:
-        """Return the present velocities of its points, (n_points, dim)."""
-
-    def fixed_velocity(self) -> np.ndarray:
-        """Return the prescribed unknowns at the new time, (n_unknowns,), anything elsewhere."""
 
 
 class RayCoupling(Coupling):
@@ -66,7 +47,7 @@ class RayCoupling(Coupling):
     N. Chentanez et al., Simultaneous coupling of fluids and deformable bodies, SCA 2006, section 3.4.
     """
 
-    def __init__(self, fluid: MacFluid, solid: HasSurface, spec: schema.Coupling) -> None:
+    def __init__(self, fluid: MacFluid, solid: SolidField, spec: schema.Coupling) -> None:
         self.fluid, self.solid, self.quadrature = fluid, solid, spec.quadrature
         self.grid = fluid.grid
         self.comm: MPI.Comm = self.grid.comm
@@ -83,7 +64,7 @@ class RayCoupling(Coupling):
             (fluid.name, solid.name): self.flux_block,
             (solid.name, fluid.name): self.force_block,
         }
-        self.touched = self.grid.zeros_cells(dtype=bool)
+        self.touched: np.ndarray = self.grid.zeros_cells(dtype=bool)
         self._positions: np.ndarray | None = None
         self._faces: list[rays.Hits] = []
         self._rows: list[Rows] = []

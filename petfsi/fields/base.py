@@ -7,8 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
+from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import Layout
 
 
@@ -73,11 +75,15 @@ class Field(ABC):
 
     @abstractmethod
     def assemble(self, time: float, dt: float) -> None:
-        """Refresh ``block`` (only if it changed), ``rhs`` and the scales for the step from ``time`` to ``time + dt``."""
+        """Refresh ``block`` (only if it changed), ``rhs`` and the scales for the step that begins at ``time``."""
 
     @abstractmethod
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the new unknowns (SI) at ``time + dt`` and move everything that moves with them."""
+
+    @abstractmethod
+    def output(self) -> dict[str, Slab]:
+        """Return what pictures and other programs want to see."""
 
     @abstractmethod
     def state(self) -> dict[str, Slab]:
@@ -87,6 +93,74 @@ class Field(ABC):
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks."""
 
-    def near_null_space(self) -> list[np.ndarray]:
-        """Return vectors (local parts) that the block nearly annihilates, for algebraic multigrid."""
-        return []
+
+class FluidField(Field):
+    """A fluid: its unknown is the pressure, and its row of the system the net outflow of a cell.
+
+    Attributes
+    ----------
+    comm : MPI.Comm
+        The ranks it lies on.
+    density : float
+        kg/m^3.
+    cell_volume : float
+        Volume of a typical cell, m^3 (m^2 in 2D).
+    geometry_version : int
+        Grows whenever cells or faces change their kind; the same on all ranks.
+    """
+
+    comm: MPI.Comm
+    density: float
+    cell_volume: float
+    geometry_version: int = 0
+
+    @abstractmethod
+    def closed_regions(self, touched: np.ndarray | None) -> list[tuple[np.ndarray, bool]]:
+        """Return each connected region without an open face, and whether it has any of the ``touched`` cells.
+
+        A region is given by 1 on its cells and 0 elsewhere, this rank's part of a pressure vector. Collective.
+        """
+
+    @abstractmethod
+    def max_divergence(self) -> float:
+        """Return the largest net outflow of a cell per face area, m/s. Collective."""
+
+    @abstractmethod
+    def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
+        """Return a quantity at a point, the same on all ranks. Collective."""
+
+
+class SolidField(Field):
+    """A solid: its unknowns are velocities, and its surface is where a fluid meets it.
+
+    Attributes
+    ----------
+    extent : float
+        Largest side of its bounding box at rest, m.
+    """
+
+    extent: float
+
+    @abstractmethod
+    def set_scale(self, reference_mass: float) -> None:
+        """Measure rows against this mass, kg: that of a fluid cell."""
+
+    @abstractmethod
+    def surface(self) -> Surface:
+        """Return the wet surface, the same on every rank."""
+
+    @abstractmethod
+    def surface_positions(self) -> np.ndarray:
+        """Return the present positions of its points, shape (n_points, dim), on every rank. Collective."""
+
+    @abstractmethod
+    def surface_velocity(self) -> np.ndarray:
+        """Return the present velocities of its points, shape (n_points, dim), on every rank. Collective."""
+
+    @abstractmethod
+    def fixed_velocity(self) -> np.ndarray:
+        """Return prescribed velocities at the end of the step by unknown, zero where free, on every rank."""
+
+    @abstractmethod
+    def probe(self, body: str, at: list[float], quantity: str) -> np.ndarray:
+        """Return a quantity of the material point that was ``at`` at rest, the same on all ranks. Collective."""

@@ -7,7 +7,6 @@ import errno
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from mpi4py import MPI
@@ -39,7 +38,6 @@ class History:
         self.path = Path(path)
         self.columns = list(columns)
         self.comm = comm
-        self._file: IO[str] | None = None
         if comm.rank == 0 and len(set(columns)) != len(self.columns):
             raise ValueError(f"a column stands twice in {columns}")
         self.truncate(None)
@@ -58,12 +56,6 @@ class History:
         """
         self._on_root(lambda: self._write(row))
 
-    def close(self) -> None:
-        """Close the file. Not collective."""
-        if self._file:
-            self._file.close()
-            self._file = None
-
     def _on_root(self, work: Callable[[], None]) -> None:
         try:
             files.on_root(self.comm, work)
@@ -74,7 +66,6 @@ class History:
             raise SolveError(f"{self.path} could not be written: {files.reason(error)}.{last}") from error
 
     def _rewrite(self, step: int | None) -> None:
-        self.close()
         rows: list[list[str]] = []
         if self.path.exists() and self.path.stat().st_size:
             header, rows = _rows(self.path)
@@ -82,19 +73,20 @@ class History:
                 raise InputError(f"{self.path} has the columns {', '.join(header)}, not {', '.join(self.columns)}")
         kept = [row for row in rows if step is None or int(row[0]) <= step]
         files.replace_text(self.path, "".join(",".join(row) + "\n" for row in [self.columns, *kept]))
-        self._file = open(self.path, "a", encoding="utf-8", newline="")
 
     def _write(self, row: Mapping[str, float]) -> None:
-        assert self._file is not None
         if row.keys() != set(self.columns):
             raise ValueError(f"a row of {self.path} has {sorted(row)} and should have {sorted(self.columns)}")
         text = ",".join(str(int(row[c])) if c in WHOLE else repr(float(row[c])) for c in self.columns)
+        handle = os.open(self.path, os.O_WRONLY | os.O_APPEND)
         try:
             # in one call to the system, so that a kill tears at most the last row
-            os.write(self._file.fileno(), (text + "\n").encode())
+            os.write(handle, (text + "\n").encode())
         except OSError as error:
             error.filename = str(self.path)
             raise
+        finally:
+            os.close(handle)
 
 
 def _rows(path: Path) -> tuple[list[str] | None, list[list[str]]]:

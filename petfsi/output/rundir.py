@@ -61,11 +61,6 @@ class RunDirectory:
         """The directory of the checkpoints."""
         return self.path / "checkpoint"
 
-    @property
-    def pictures(self) -> Path:
-        """The directory that ``petfsi plot`` fills."""
-        return self.path / "pictures"
-
     @classmethod
     def create(cls, path: Path, scene_text: str, options_text: str, overwrite: bool, comm: MPI.Comm) -> RunDirectory:
         """Make the directory of a new run. Collective.
@@ -94,21 +89,6 @@ class RunDirectory:
             raise InputError(f"{path} is not the directory of a run: it has no {MARKER}")
         return run
 
-    def texts(self, comm: MPI.Comm) -> tuple[str, str]:
-        """Return the scene and the options that the run was started with. Collective."""
-        try:
-            return files.on_root(
-                comm, lambda: (self.scene.read_text(encoding="utf-8"), self.options.read_text(encoding="utf-8"))
-            )
-        except OSError as error:
-            raise InputError(f"{error.filename} cannot be read: {files.reason(error)}") from error
-
-    def say(self, line: str) -> None:
-        """Add a line to ``log.txt``. Rank 0 alone."""
-        # a disk that is full is reported by what matters more, and on all ranks: the history and the checkpoint
-        with suppress(OSError), open(self.log, "a", encoding="utf-8") as file:
-            file.write(line + "\n")
-
     def _is_run(self) -> bool:
         return (self.path / MARKER).is_file()
 
@@ -117,9 +97,7 @@ class RunDirectory:
             raise InputError(f"run directory {self.path}: there is a file of that name")
         if self.path.is_dir() and any(self.path.iterdir()):
             if not self._is_run():
-                raise InputError(
-                    f"run directory {self.path} is not empty, and what is in it is not a run; name another"
-                )
+                raise InputError(f"run directory {self.path} is not empty and holds no run; name another")
             if not overwrite:
                 raise InputError(
                     f"run directory {self.path} holds a run already; continue it with 'petfsi resume {self.path}', "

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Field, Reader, Slab
+from petfsi.fields.base import FluidField, Reader, Slab
 from petfsi.fields.mac import advect, kinds, pressure, views
 from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.grid import MacGrid, three
@@ -20,7 +20,7 @@ from petfsi.scene.schema import Number, Scene
 MAX_COURANT = 4.0
 
 
-class MacFluid(Field):
+class MacFluid(FluidField):
     """A field whose unknown is the pressure of every cell of the grid.
 
     A step: ``predict`` advects velocity (and smoke) along the flow at the old time and adds forces, which gives
@@ -57,6 +57,7 @@ class MacFluid(Field):
             raise InputError(f"fluid.cells = {fluid.cells}: a periodic axis needs at least 3 cells")
         self.grid = grid = MacGrid(comm, fluid.origin, fluid.size, fluid.cells, periodic)
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
+        self.cell_volume = grid.cell_volume
         self.surroundings = Surroundings(grid, fluid.sides)
         for name, obstacle in scene.obstacles.items():
             self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)

@@ -8,14 +8,15 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Field, Reader, Slab
+from petfsi.fields.base import Reader, Slab, SolidField
 from petfsi.fields.solid.elements import Bodies, Elements
 from petfsi.fields.solid.materials import MATERIALS, lame_parameters
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.probes import Place, locate
 from petfsi.fields.solid.supports import Elimination, Supports
-from petfsi.geometry.meshes import SimplexMesh, build_mesh, from_root
+from petfsi.geometry.bodies import build_bodies
+from petfsi.geometry.meshes import SimplexMesh, from_root
 from petfsi.geometry.surfaces import Surface, boundary_facets, shells
 from petfsi.integrators import INTEGRATORS, Coefficients, Integrator
 from petfsi.petsc import IntType, Layout, new_block, set_csr
@@ -23,7 +24,7 @@ from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene, Solid
 
 
-class SimplexSolid(Field):
+class SimplexSolid(SolidField):
     """The solids of a scene; the unknown is the velocity u of every node at the new time.
 
     A step solves  A u = b + J p  (see ``integrators``) and moves the nodes by the integrator's rule. Unknown
@@ -285,9 +286,7 @@ class SimplexSolid(Field):
 
 
 def _union(scene: Scene) -> SimplexMesh:
-    return SimplexMesh.union(
-        [build_mesh(solid, scene.dim, f"solids.{name}", scene.directory) for name, solid in scene.solids.items()]
-    )
+    return SimplexMesh.union(list(build_bodies(scene).values()))
 
 
 def _bodies(solids: dict[str, Solid]) -> Bodies:

@@ -4,40 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from petfsi.errors import InputError
 from petfsi.fields.solid.pattern import Pattern
-from petfsi.geometry.shapes import inside
+from petfsi.geometry.bodies import supported
 from petfsi.petsc import Layout
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Solid, Support
-
-#: Nodes this far from a side of the bounding box, as a fraction of its size, lie on it (files may hold single
-#: precision).
-TOLERANCE = 1e-6
-
-_SIDES = {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1), "back": (2, 0), "front": (2, 1)}
-
-
-def supported(support: Support, points: np.ndarray, key: str) -> np.ndarray:
-    """Return which reference points of one body a support holds.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    if not isinstance(support.where, str):
-        held = inside(support.where, points)
-    elif support.where == "all":
-        held = np.ones(len(points), dtype=bool)
-    else:
-        axis, end = _SIDES[support.where]
-        lower, upper = points.min(axis=0), points.max(axis=0)
-        side = (lower, upper)[end][axis]
-        held = np.abs(points[:, axis] - side) <= TOLERANCE * (upper - lower).max()
-    if not held.any():
-        raise InputError(f"{key}.where: no node of the solid lies there")
-    return held
+from petfsi.scene.schema import Solid
 
 
 class Supports:

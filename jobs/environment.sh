@@ -1,0 +1,5 @@
+# One thread per rank, and HDF5 with MPI even on one rank; Open MPI refuses root unless told otherwise.
+export OMP_NUM_THREADS=1 H5PY_ALWAYS_USE_MPI=1
+if [ "$(id -u)" = 0 ]; then
+    export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
+fi

@@ -1,0 +1,50 @@
+"""Measurements that stand for themselves: each bench is one module and one line here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What a bench measures, and how long that takes, whole and with ``--quick``, on one core of a laptop."""
+
+    about: str
+    whole: str
+    quick: str
+
+
+#: Each name is a module of this package whose ``run(case)`` returns a ``Report``.
+BENCHES = {
+    "column": Bench("first frequency and damping of a layer under water, against theory", "90 s", "20 s"),
+    "splitting": Bench("growth per step of the split scheme, against linear theory", "40 s", "20 s"),
+    "stability": Bench("which schemes, steps and dampings keep the bar in a jet bounded", "3 h", "4 min"),
+    "phases": Bench("seconds per phase and step, monolithic against split, on the bar", "3 min", "30 s"),
+}
+
+
+def describe() -> str:
+    """Return the list of benches."""
+    lines = [f"  {name:<11}{b.about} ({b.whole}; --quick {b.quick})" for name, b in BENCHES.items()]
+    return "\n".join(["petfsi bench NAME measures one of", *lines])
+
+
+def run_bench(comm: MPI.Comm, name: str, out: Path, quick: bool) -> int:
+    """Run a bench, write ``out/name.csv`` and ``.png``, print its table; return 0 if its bounds hold, else 1.
+
+    Collective.
+    """
+    from petfsi.bench.case import Case
+    from petfsi.bench.report import publish
+
+    case = Case(comm, quick, out)
+    report = import_module(f"petfsi.bench.{name}").run(case)
+    if comm.rank == 0:
+        publish(report, out, name)
+    return 1 if report.failures else 0

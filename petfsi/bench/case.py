@@ -1,0 +1,107 @@
+"""Simulations for measurements: in this process, without run directories, each with its own PETSc options."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from petfsi import solve
+from petfsi.build import field_names
+from petfsi.errors import InputError
+from petfsi.geometry.meshes import from_root
+from petfsi.scene.load import apply_set, scene_from_dict
+from petfsi.scene.schema import Scene
+from petfsi.simulation import Simulation
+
+MONOLITHIC, SPLIT, ITERATED = "monolithic.opts", "split.opts", "split-iterated.opts"
+
+
+@dataclass(frozen=True)
+class Case:
+    """How a bench is run: on these ranks, in full or not, with files for its own use under ``out``."""
+
+    comm: MPI.Comm
+    quick: bool
+    out: Path
+
+
+def job(comm: MPI.Comm, name: str, sets: dict[str, Any]) -> Scene:
+    """Return a scene of ``jobs/`` with settings changed. Collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    name : str
+        Without folder and ending.
+    sets : dict
+        Values by key, such as ``{"time.dt": 0.01}``; missing tables are made.
+    """
+    path = Path(__file__).parents[2] / "jobs" / f"{name}.toml"
+
+    def read() -> Scene:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; a bench needs the jobs/ of petfsi's checkout")
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        for key, value in sets.items():
+            apply_set(data, f"{key}=0")  # finds or makes the place
+            _put(data, key, copy.deepcopy(value))
+        return scene_from_dict(data, path.parent)
+
+    return from_root(comm, read)
+
+
+def _put(data: Any, key: str, value: Any) -> None:
+    *tables, last = key.split(".")
+    for part in tables:
+        data = data[int(part) if isinstance(data, list) else part]
+    data[int(last) if isinstance(data, list) else last] = value
+
+
+@contextmanager
+def only_options(args: list[str], fields: list[str]) -> Iterator[None]:
+    """Have these PETSc options of petfsi's, and no others, in force inside. Collective.
+
+    Solvers read theirs when they are set up, some when they are first applied, so both must happen inside.
+    """
+    _clear()
+    try:
+        solve.load_options(args, fields)
+        yield
+    finally:
+        _clear()
+
+
+def _clear() -> None:
+    options = PETSc.Options()
+    for name in options.getAll():
+        if name.startswith(solve.PREFIX):
+            options.delValue(name)
+
+
+@contextmanager
+def simulation(comm: MPI.Comm, scene: Scene, options: str) -> Iterator[Simulation]:
+    """Have a simulation of a scene, solved as a shipped options file says. Collective."""
+    with only_options(["-options_file", options], field_names(scene)):
+        sim = Simulation(comm, scene)
+        sim.prepare()
+        yield sim
+
+
+def history(comm: MPI.Comm, scene: Scene, options: str, steps: int, column: str = "top.y") -> np.ndarray:
+    """Return a probe's value at the start and after each of ``steps`` steps. Collective."""
+    with simulation(comm, scene, options) as sim:
+        wanted = sim.probe_columns().index(column)
+        values = [sim.probe()[wanted]]
+        for _ in range(steps):
+            sim.advance()
+            values.append(sim.probe()[wanted])
+    return np.array(values)

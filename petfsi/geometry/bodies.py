@@ -1,0 +1,171 @@
+"""The solids of a scene as meshes, and where they may stand."""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations
+
+import numpy as np
+from numba import njit
+
+from petfsi.errors import InputError
+from petfsi.geometry.meshes import build_mesh, read_surface
+from petfsi.geometry.shapes import inside
+from petfsi.geometry.surfaces import boundary_facets
+from petfsi.scene.checks import check_inside_grid
+from petfsi.scene.schema import Obstacle, Scene, Solid, Support
+
+#: Nodes this far from a side of the bounding box, as a fraction of its size, lie on it (files may hold single
+#: precision).
+TOLERANCE = 1e-6
+
+_SIDES = {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1), "back": (2, 0), "front": (2, 1)}
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+def build_bodies(scene: Scene) -> dict[str, Mesh]:
+    """Return points and cells of every solid. Not collective.
+
+    Raises
+    ------
+    InputError
+        With every mesh that is not fit for a computation, and every body that starts outside the fluid's grid, in
+        an obstacle or in another body.
+    """
+    meshes: dict[str, Mesh] = {}
+    mistakes: list[str] = []
+    for name, solid in scene.solids.items():
+        key = f"solids.{name}"
+        try:
+            mesh = build_mesh(solid, scene.dim, key, scene.directory)
+            check_inside_grid(scene, f"{key}.shape", mesh[0])
+            for n, support in enumerate(solid.supports):
+                supported(support, mesh[0], f"{key}.supports.{n}")
+            meshes[name] = mesh
+        except InputError as error:
+            mistakes.append(str(error))
+    mistakes += _in_obstacles(scene, meshes)
+    mistakes += _in_each_other(meshes)
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return meshes
+
+
+def supported(support: Support, points: np.ndarray, key: str) -> np.ndarray:
+    """Return which reference points of one body a support holds.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if not isinstance(support.where, str):
+        held = inside(support.where, points)
+    elif support.where == "all":
+        held = np.ones(len(points), dtype=bool)
+    else:
+        axis, end = _SIDES[support.where]
+        lower, upper = points.min(axis=0), points.max(axis=0)
+        side = (lower, upper)[end][axis]
+        held = np.abs(points[:, axis] - side) <= TOLERANCE * (upper - lower).max()
+    if not held.any():
+        lower, upper = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        raise InputError(f"{key}.where: no node of the solid lies there; its nodes reach from {lower} to {upper} m")
+    return held
+
+
+# ---- apart from each other ----------------------------------------------------------------------------------
+
+
+def _in_obstacles(scene: Scene, meshes: dict[str, Mesh]) -> list[str]:
+    """Return a sentence for every body in an obstacle; it is tested where the cells have their centres."""
+    found = []
+    for obstacle_name, obstacle in scene.obstacles.items():
+        try:
+            for name, (points, cells) in meshes.items():
+                free = cells[~_clamped(scene.solids[name], points)[cells].any(axis=1)]
+                centres = points[free].mean(axis=1)
+                key = f"obstacles.{obstacle_name}.shape"
+                count = np.count_nonzero(_covers(obstacle, centres, scene, key))
+                if count:
+                    found.append(
+                        f"solids.{name}.shape: overlaps obstacles.{obstacle_name} with {count} of {len(cells)} cells; "
+                        "a solid must lie beside obstacles (cells at nodes that are held on all axes may reach in)"
+                    )
+        except InputError as error:
+            found.append(str(error))
+    return found
+
+
+def _clamped(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Return which nodes are held on all axes, as those in a wall are."""
+    held = np.zeros(points.shape, dtype=bool)
+    for support in solid.supports:
+        where = supported(support, points, "supports")
+        for axis in support.fix:
+            held[where, "xyz".index(axis)] = True
+    return held.all(axis=1)
+
+
+def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> np.ndarray:
+    if obstacle.shape.mesh is None:
+        covered = inside(obstacle.shape, points)
+    else:
+        covered = enclosed(*read_surface(obstacle.shape, scene.dim, key, scene.directory), points)
+    return covered != obstacle.outside
+
+
+def _in_each_other(meshes: dict[str, Mesh]) -> list[str]:
+    """Return a sentence for every pair of bodies that share material."""
+    counts: dict[tuple[str, str], int] = {}
+    for one, other in permutations(meshes, 2):
+        centres = meshes[one][0][meshes[one][1]].mean(axis=1)
+        points, cells = meshes[other]
+        if _apart(centres, points):
+            continue
+        count = int(np.count_nonzero(enclosed(points, boundary_facets(points, cells), centres)))
+        pair = (one, other) if list(meshes).index(one) < list(meshes).index(other) else (other, one)
+        counts[pair] = counts.get(pair, 0) + count
+    return [
+        f"solids.{second}.shape: overlaps solids.{first} ({count} cells); bodies must lie apart"
+        for (first, second), count in counts.items()
+        if count
+    ]
+
+
+def _apart(points: np.ndarray, others: np.ndarray) -> bool:
+    below, above = points.max(axis=0) < others.min(axis=0), points.min(axis=0) > others.max(axis=0)
+    return bool(np.any(below | above))
+
+
+def enclosed(points: np.ndarray, facets: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return which of the points ``at`` a closed, oriented surface winds around. Not collective."""
+    corners = np.ascontiguousarray(points[facets], dtype=float)
+    near = np.all((at >= points.min(axis=0)) & (at <= points.max(axis=0)), axis=1)
+    result = np.zeros(len(at), dtype=bool)
+    result[near] = np.abs(_windings(corners, np.ascontiguousarray(at[near], dtype=float))) > 0.5
+    return result
+
+
+@njit(cache=True)
+def _windings(corners, at):
+    """Return how often the surface winds around each point: the angle it fills, over that of a full turn."""
+    total = np.zeros(len(at))
+    two = corners.shape[2] == 2
+    for n in range(len(at)):
+        for f in range(len(corners)):
+            a, b = corners[f, 0] - at[n], corners[f, 1] - at[n]
+            if two:
+                total[n] += math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
+                continue
+            c = corners[f, 2] - at[n]
+            la, lb, lc = math.sqrt(np.sum(a * a)), math.sqrt(np.sum(b * b)), math.sqrt(np.sum(c * c))
+            volume = (
+                a[0] * (b[1] * c[2] - b[2] * c[1])
+                - a[1] * (b[0] * c[2] - b[2] * c[0])
+                + a[2] * (b[0] * c[1] - b[1] * c[0])
+            )
+            ab, bc, ca = np.sum(a * b), np.sum(b * c), np.sum(c * a)
+            total[n] += 2.0 * math.atan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return total / (2.0 * math.pi if two else 4.0 * math.pi)

@@ -1,0 +1,356 @@
+"""Pictures of a run: its history, and the scene at every output time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import LightSource, ListedColormap, Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from scipy.ndimage import distance_transform_edt
+
+from petfsi.errors import InputError
+from petfsi.fields.mac.kinds import FLUID, OBSTACLE, OUTSIDE, SOLID
+from petfsi.geometry.surfaces import boundary_facets
+from petfsi.output.fields import field_files
+from petfsi.output.history import read_history
+from petfsi.output.slices import cut_tetrahedra
+from petfsi.output.xdmf import GridInfo
+
+#: What may be shown, the first of a fluid that varies by more than so much: label, colours, and that much.
+_SHOWN = {
+    "smoke": ("smoke", "magma", 1e-6),
+    "speed": ("speed, m/s", "viridis", 1e-6),
+    "pressure": ("pressure, Pa", "cividis", 1e-9),
+    "displacement": ("displacement, m", "viridis", 0.0),
+}
+_BODIES = ("#f3dcbd", "#c7dff0", "#d5ecc9", "#f2cdd6", "#e0d3ee")
+_LINE, _GREY = "#4a3b2c", "#8c8c8c"
+#: More edges than this are a dark stain, not a mesh.
+_MANY_EDGES = 6000
+#: Arrows along the longer side of a plane.
+_ARROWS = 30
+_DPI = 130
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What one output file holds; cell data as (nx, ny[, nz])."""
+
+    step: int
+    time: float
+    fluid: dict[str, np.ndarray]
+    points: np.ndarray | None
+    displacement: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """What is the same in all pictures."""
+
+    grid: GridInfo | None
+    cells: np.ndarray
+    body: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    shown: str
+    norm: Normalize
+
+    @property
+    def dim(self) -> int:
+        return len(self.low)
+
+
+def plot_run(directory: Path, every: int = 1) -> list[Path]:
+    """Draw ``pictures/history.png`` and ``pictures/NNNNNN.png`` for every K-th output time, and return them.
+
+    Colours and frames mean the same in all of them. Not collective.
+
+    Raises
+    ------
+    InputError
+        When there is nothing to draw, or a file is damaged.
+    """
+    directory = Path(directory)
+    history, frames = directory / "history.csv", field_files(directory)[::every]
+    if not history.exists() and not frames:
+        raise InputError(f"{directory} has neither history.csv nor fields, so there is nothing to draw")
+    pictures = directory / "pictures"
+    pictures.mkdir(exist_ok=True)
+    drawn = []
+    if history.exists():
+        drawn.append(_save(_history_figure(read_history(history)), pictures / "history.png"))
+    if frames:
+        try:
+            stage = _stage(directory, frames)
+            for frame in map(_read, frames):
+                figure = _plane_figure(stage, frame) if stage.dim == 2 else _space_figure(stage, frame)
+                drawn.append(_save(figure, pictures / f"{frame.step:06d}.png"))
+        except (OSError, KeyError) as error:
+            raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
+    return drawn
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    figure.savefig(path, dpi=_DPI)
+    return path
+
+
+# ---- history ------------------------------------------------------------------------------------------------
+
+
+def _history_figure(table: dict[str, np.ndarray]) -> Figure:
+    """Return every column over time: the components of a probe share a panel."""
+    panels: dict[str, list[str]] = {}
+    for name in table:
+        if name not in ("step", "time", "dt", "iterations", "residual"):
+            panels.setdefault(name.rpartition(".")[0] or name, []).append(name)
+    panels |= {name: [name] for name in ("iterations", "residual") if name in table}
+    figure = Figure(figsize=(8.0, 1.9 * len(panels) + 0.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)) if panels else []
+    for ax, (title, columns) in zip(axes, panels.items(), strict=True):
+        for column in columns:
+            values = table[column]
+            label = column.rpartition(".")[2] if len(columns) > 1 else None
+            ax.plot(
+                table["time"], values, lw=1.3, label=label, drawstyle="steps-post" if title == "iterations" else None
+            )
+        if title == "residual" and np.any(table["residual"] > 0):
+            ax.set_yscale("log")
+        if len(columns) > 1:
+            ax.legend(loc="best", ncols=len(columns), frameon=False, fontsize="small")
+        ax.set_ylabel(title)
+        ax.grid(alpha=0.3)
+        ax.margins(x=0)
+    if panels:
+        axes[-1].set_xlabel("time, s")
+    return figure
+
+
+# ---- reading ------------------------------------------------------------------------------------------------
+
+
+def _read(path: Path) -> _Frame:
+    with h5py.File(path, "r") as file:
+        fluid = {}
+        for name, array in file.get("fluid", {}).items():
+            data = array[()]
+            dim = data.ndim - (name == "velocity")
+            fluid[name] = data.transpose([*reversed(range(dim)), *range(dim, data.ndim)])
+        solid = file.get("solid")
+        points = solid["points"][()] if solid else None
+        displacement = solid["displacement"][()] if solid else None
+        return _Frame(int(file.attrs["step"]), float(file.attrs["time"]), fluid, points, displacement)
+
+
+def _stage(directory: Path, paths: Sequence[Path]) -> _Stage:
+    """Look through all files once, so that colours and frames mean the same in all pictures."""
+    with h5py.File(directory / "fields" / "mesh.h5", "r") as file:
+        grid = (
+            GridInfo(*(json.loads(file.attrs[k]) for k in ("origin", "spacing", "cells"))) if "grid" in file else None
+        )
+        cells = file["solid/cells"][()] if "solid" in file else np.empty((0, 3), dtype=np.int32)
+        body = file["solid/body"][()] if "solid" in file else np.empty(0, dtype=np.int32)
+    names = ("smoke", "speed", "pressure") if grid else ("displacement",)
+    ranges: dict[str, list[tuple[float, float]]] = {}
+    boxes = []
+    for frame in map(_read, paths):
+        for name in names:
+            values = _values(frame, name)
+            if values is not None and np.isfinite(values).any():
+                ranges.setdefault(name, []).append((float(np.nanmin(values)), float(np.nanmax(values))))
+        if frame.points is not None:
+            boxes.append((frame.points.min(axis=0), frame.points.max(axis=0)))
+    if grid:
+        low = np.array(grid.origin)
+        high = low + np.array(grid.spacing) * grid.cells
+    else:
+        low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+        margin = 0.06 * np.max(high - low)
+        low, high = low - margin, high + margin
+    shown, norm = _choose(ranges)
+    return _Stage(grid, cells, body, low, high, shown, norm)
+
+
+def _choose(ranges: dict[str, list[tuple[float, float]]]) -> tuple[str, Normalize]:
+    """Return the first quantity that varies, in space or time, and its colour scale."""
+    shown, low, high = "pressure", 0.0, 0.0
+    for name, extremes in sorted(ranges.items(), key=lambda item: list(_SHOWN).index(item[0])):
+        shown, low, high = name, min(e[0] for e in extremes), max(e[1] for e in extremes)
+        if high - low > max(_SHOWN[name][2], 1e-9 * abs(high)):
+            break
+    if shown != "pressure":
+        low = min(low, 0.0)
+    return shown, Normalize(low, high if high > low else low + 1.0)
+
+
+def _values(frame: _Frame, name: str) -> np.ndarray | None:
+    """Return a quantity: NaN where a cell holds no fluid, None where there is no such thing."""
+    if name == "displacement":
+        return None if frame.displacement is None else np.linalg.norm(frame.displacement, axis=1)
+    if name == "speed":
+        values = np.linalg.norm(frame.fluid["velocity"], axis=-1) if "velocity" in frame.fluid else None
+    else:
+        values = frame.fluid.get(name)
+    if values is None:
+        return None
+    kind = frame.fluid.get("kind", np.zeros(values.shape, dtype=np.uint8))
+    return np.where(kind == FLUID, values, np.nan)
+
+
+# ---- drawing ------------------------------------------------------------------------------------------------
+
+
+def _plane_figure(stage: _Stage, frame: _Frame) -> Figure:
+    """Return the picture of a 2D scene."""
+    extent = stage.high - stage.low
+    scale = min(9.0 / extent[0], 7.5 / extent[1])
+    figure = Figure(
+        figsize=(max(3.6, extent[0] * scale + 1.9), max(2.6, extent[1] * scale + 1.0)), layout="constrained"
+    )
+    ax = figure.subplots()
+    mappable = _draw_cells(ax, stage, frame, (0, 1), None) if stage.grid else None
+    if frame.points is not None:
+        if stage.grid:
+            many = len(stage.cells) * 3 >= _MANY_EDGES
+            _draw_polygons(ax, list(frame.points[stage.cells]), _body_colours(stage), many)
+        else:
+            style: dict[str, Any] = {"shading": "gouraud", "cmap": _SHOWN[stage.shown][1], "norm": stage.norm}
+            x, y = frame.points.T
+            mappable = ax.tripcolor(x, y, np.asarray(_values(frame, stage.shown)), triangles=stage.cells, **style)
+        border = boundary_facets(frame.points, stage.cells)
+        ax.add_collection(LineCollection(list(frame.points[border]), colors=_LINE, lw=1.1))
+    _finish(ax, stage, (0, 1))
+    ax.set_title(f"t = {frame.time:.4g} s", fontsize="medium")
+    if mappable:
+        figure.colorbar(mappable, ax=ax, label=_SHOWN[stage.shown][0], aspect=30, shrink=0.9)
+    return figure
+
+
+def _space_figure(stage: _Stage, frame: _Frame) -> Figure:
+    """Return the picture of a 3D scene: two slices through the middle of the solids or the grid, and a view."""
+    extent = stage.high - stage.low
+    middle = 0.5 * (stage.low + stage.high)
+    if frame.points is not None:
+        middle = np.clip(frame.points.mean(axis=0), stage.low, stage.high)
+    n_panels = 2 if frame.points is None else 3
+    height = np.clip(4.4 * max(extent[1], extent[2]) / extent[0], 3.0, 7.0)
+    figure = Figure(figsize=(5.0 * n_panels, height + 1.6), layout="constrained")
+    places = figure.add_gridspec(1, n_panels)
+    mappable, panels = None, []
+    for place, across, axis in ((places[0, 0], (0, 1), 2), (places[0, 1], (0, 2), 1)):
+        ax = figure.add_subplot(place)
+        panels.append(ax)
+        if stage.grid:
+            mappable = _draw_cells(ax, stage, frame, across, middle[axis])
+        if frame.points is not None:
+            polygons, owners = cut_tetrahedra(frame.points, stage.cells, axis, middle[axis])
+            _draw_polygons(ax, polygons, _body_colours(stage)[owners], len(polygons) * 3 >= _MANY_EDGES)
+        _finish(ax, stage, across)
+        ax.set_title(f"{'xyz'[axis]} = {middle[axis]:.3g} m", fontsize="medium")
+    if frame.points is not None:
+        _draw_surface(figure.add_subplot(places[0, 2], projection="3d"), stage, frame.points)
+    if mappable:
+        figure.colorbar(mappable, ax=panels, label=_SHOWN[stage.shown][0], shrink=0.6, location="bottom", aspect=50)
+    figure.suptitle(f"t = {frame.time:.4g} s", fontsize="large")
+    return figure
+
+
+def _draw_cells(
+    ax: Axes, stage: _Stage, frame: _Frame, across: tuple[int, int], at: float | None
+) -> ScalarMappable | None:
+    """Draw the cells of the plane at ``at``, rigid things in grey; return what a colour bar needs."""
+    values, kind, flow = _values(frame, stage.shown), frame.fluid.get("kind"), frame.fluid.get("velocity")
+    if at is not None and stage.grid:
+        axis = 3 - sum(across)
+        index = int(np.clip((at - stage.low[axis]) / stage.grid.spacing[axis], 0, stage.grid.cells[axis] - 1))
+        values, kind, flow = (None if a is None else np.take(a, index, axis=axis) for a in (values, kind, flow))
+    if values is None:
+        return None
+    if kind is not None and np.any(kind == SOLID) and np.any(np.isfinite(values)):
+        # the solid is drawn over these with its true outline; colour goes on beneath it instead of leaving stairs
+        nearest = distance_transform_edt(~np.isfinite(values), return_distances=False, return_indices=True)
+        values = np.where(kind == SOLID, values[tuple(nearest)], values)
+    a, b = across
+    extent = (stage.low[a], stage.high[a], stage.low[b], stage.high[b])
+    style: dict[str, Any] = {"origin": "lower", "extent": extent, "aspect": "equal", "interpolation": "nearest"}
+    image = ax.imshow(values.T, cmap=_SHOWN[stage.shown][1], norm=stage.norm, **style)
+    if kind is not None:
+        rigid = np.where((kind == OBSTACLE) | (kind == OUTSIDE), 1.0, np.nan)
+        ax.imshow(rigid.T, cmap=ListedColormap([_GREY]), **style)
+        if flow is not None and stage.shown == "speed":
+            _draw_arrows(ax, stage, np.where((kind == FLUID)[..., None], flow, np.nan)[..., list(across)], across)
+    return image
+
+
+def _draw_arrows(ax: Axes, stage: _Stage, flow: np.ndarray, across: tuple[int, int]) -> None:
+    """Draw the velocity in a plane by some arrows, as long as their spacing where the flow is fastest."""
+    every = max(1, max(flow.shape[:2]) // _ARROWS)
+    sides = [
+        np.linspace(stage.low[a], stage.high[a], 2 * flow.shape[n] + 1)[1::2][every // 2 :: every]
+        for n, a in enumerate(across)
+    ]
+    some = flow[every // 2 :: every, every // 2 :: every]
+    gap = every * (stage.high[across[0]] - stage.low[across[0]]) / flow.shape[0]
+    style: dict[str, Any] = {
+        "color": "white",
+        "alpha": 0.6,
+        "width": 0.0018,
+        "angles": "xy",
+        "scale_units": "xy",
+        "pivot": "mid",
+    }
+    ax.quiver(*sides, some[..., 0].T, some[..., 1].T, scale=stage.norm.vmax / (1.3 * gap), **style)
+
+
+def _draw_polygons(ax: Axes, polygons: list[np.ndarray], colours: np.ndarray, many: bool) -> None:
+    # an edge in the colour of the face closes the hairlines between neighbours
+    ax.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours if many else _LINE, lw=0.3))
+
+
+def _draw_surface(ax: Axes3D, stage: _Stage, points: np.ndarray) -> None:
+    """Draw the solids' surface, shaded, in the box of the grid; y points up, as gravity does in most scenes."""
+    body_of_node = np.zeros(len(points), dtype=np.int64)
+    body_of_node[stage.cells] = stage.body[:, None]
+    facets = boundary_facets(points, stage.cells)
+    colours = _palette(body_of_node[facets[:, 0]])
+    light = LightSource(azdeg=27, altdeg=34)  # from (0.4, 0.8, 0.6)
+    style: dict[str, Any] = {
+        "facecolors": colours,
+        "edgecolors": colours,
+        "lw": 0.2,
+        "shade": True,
+        "lightsource": light,
+    }
+    ax.add_collection3d(Poly3DCollection(points[facets], **style))
+    ax.set(xlim=(stage.low[0], stage.high[0]), ylim=(stage.low[1], stage.high[1]), zlim=(stage.low[2], stage.high[2]))
+    ax.view_init(elev=20, azim=30, vertical_axis="y")
+    ax.set_box_aspect(stage.high - stage.low)  # after view_init, which decides what it means
+    ax.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.set_major_locator(MaxNLocator(4))
+
+
+def _body_colours(stage: _Stage) -> np.ndarray:
+    return _palette(stage.body)
+
+
+def _palette(body: np.ndarray) -> np.ndarray:
+    return np.array([to_rgb(colour) for colour in _BODIES])[body % len(_BODIES)]
+
+
+def _finish(ax: Axes, stage: _Stage, across: tuple[int, int]) -> None:
+    a, b = across
+    ax.set(xlim=(stage.low[a], stage.high[a]), ylim=(stage.low[b], stage.high[b]), aspect="equal")
+    ax.set(xlabel=f"{'xyz'[a]}, m", ylabel=f"{'xyz'[b]}, m")
