@@ -183,6 +183,29 @@ def plot(ctx: click.Context, directory: Path, every: int) -> NoReturn:
 
 
 @cli.command()
+@click.argument("name", required=False)
+@click.option("--out", type=click.Path(path_type=Path), default="runs/bench", help="Folder; runs/bench by default.")
+@click.option("--quick", is_flag=True, help="Measure less, in a fraction of the time.")
+@click.pass_context
+def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoReturn:
+    """Measure petfsi against theory: bench NAME, or list what there is.
+
+    Writes a table and a picture. Exit code 1 if a row is out of its bounds.
+    """
+
+    def work(comm: MPI.Comm) -> int:
+        from petfsi.bench import describe, run_bench
+
+        if name is None:
+            _say(describe())
+            return 0
+        _start_petsc([])
+        return run_bench(comm, name, out, quick)
+
+    ctx.exit(_together(work))
+
+
+@cli.command()
 @click.pass_context
 def info(ctx: click.Context) -> NoReturn:
     """Print versions, what PETSc was built with, solver prefixes and the shipped options files."""
@@ -207,7 +230,8 @@ def _start_petsc(options: Sequence[str]) -> None:
             next(words, None)
         else:
             given.append(word)
-    petsc4py.init(["petfsi", *given])
+    # PETSc's signal handler would end a run whose reader has left, or that is asked to stop while it sets up
+    petsc4py.init(["petfsi", "-no_signal_handler", *given])
 
 
 # ---- how commands end ---------------------------------------------------------------------------------------

@@ -45,7 +45,8 @@ class Console:
         if not self._speaks:
             return
         if log_path is not None:
-            self._log = os.open(log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            with suppress(OSError):
+                self._log = os.open(log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
         if sys.stdout.isatty() and not _is_launched():
             self._start_bar(total)
 
@@ -74,6 +75,10 @@ class Console:
         """Say what a user should look at though the run goes on."""
         self._write(f"warning: {text}")
 
+    def log(self, text: str) -> None:
+        """Say something in the log file only."""
+        self._write(text, shown=False)
+
     def _write(self, line: str, shown: bool = True) -> None:
         if not self._speaks:
             return
@@ -88,7 +93,7 @@ class Console:
     def _print(self, line: str) -> None:
         try:
             print(line, flush=True)
-        except BrokenPipeError:
+        except OSError:
             # what is left in the buffer would be tried again, and complained of, when Python ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
+from petfsi.output.files import on_root
 
 IntType = PETSc.IntType
 
@@ -129,16 +130,26 @@ def insert_options_file(path: Path) -> None:
     InputError
         If the file cannot be read or PETSc does not understand it.
     """
-    if not path.is_file():
-        raise InputError(f"-options_file {path}: no such file; petfsi's own are listed by 'petfsi info'")
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
-        words = line.split("#")[0].split()
-        if words and not words[0].startswith("-"):
-            raise InputError(f"{path}, line {number}: '{line.strip()}' is no option; wanted '-name [value]' or '# ...'")
+    on_root(MPI.COMM_WORLD, lambda: _check_options_file(path))
     try:
         PETSc.Options().insertString(f"-options_file {path}")
     except PETSc.Error as error:
         raise InputError(f"-options_file {path}: PETSc cannot read it ({error})") from None
+
+
+def _check_options_file(path: Path) -> None:
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise InputError(f"-options_file {path}: {what}; petfsi's own are listed by 'petfsi info'")
+    try:
+        text = path.read_text(errors="replace")
+    except OSError as error:
+        raise InputError(f"-options_file {path}: cannot be read: {error.strerror}") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#")[0].split()
+        if words and not words[0].startswith("-"):
+            found = line.strip() if len(line) < 60 else line.strip()[:57] + "..."
+            raise InputError(f"{path}, line {number}: {found!r} is no option; wanted '-name [value]' or '# ...'")
 
 
 def insert_options(args: list[str]) -> None:

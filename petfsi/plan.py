@@ -119,8 +119,8 @@ def _count(end: float, every: float) -> int:
 
 def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     """Return nodes and cells of each solid; where counting is not enough the meshes are built and judged."""
-    if all(_is_plain(solid) for solid in scene.solids.values()) and not scene.obstacles:
-        boxes = {name: solid.shape.box.cells for name, solid in scene.solids.items()}
+    boxes = {name: cells for name, solid in scene.solids.items() if (cells := _plain_cells(solid)) is not None}
+    if len(boxes) == len(scene.solids) and not scene.obstacles:
         nodes = {name: math.prod(n + 1 for n in box) for name, box in boxes.items()}
         return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
     from petfsi.geometry.bodies import build_bodies
@@ -142,11 +142,11 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     return {n: len(points) for n, (points, _) in meshes.items()}, {n: len(cells) for n, (_, cells) in meshes.items()}
 
 
-def _is_plain(solid: Solid) -> bool:
-    """Return whether nothing about a solid can be wrong that the scene alone does not show."""
+def _plain_cells(solid: Solid) -> list[int] | None:
+    """Return the cells of a box about which nothing can be wrong that the scene alone does not show."""
     shape = solid.shape
     named = all(isinstance(support.where, str) for support in solid.supports)
-    return shape.box is not None and shape.box.cells is not None and shape.cavity is None and named
+    return shape.box.cells if shape.box is not None and shape.cavity is None and named else None
 
 
 def _state_bytes(scene: Scene, nodes: int, cells: int) -> float:

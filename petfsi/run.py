@@ -5,6 +5,8 @@ from __future__ import annotations
 import platform
 import signal
 import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -12,20 +14,22 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi import __version__, petsc, solve
-from petfsi.build import field_names
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
+from petfsi.geometry.meshes import from_root
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
+from petfsi.plan import skipped
 from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 
 DONE, STOPPED = 0, 75
+Status = Literal["done", "stopped", "failed"]
 
 #: What a row of history.csv says besides the probes and the solver.
 ACCOUNTS = ("volume_error", "divergence")
@@ -73,48 +77,76 @@ class Run:
         self.files = files
         self.console = console
         self.comm = simulation.comm
-        self.history = History(files.history, column_names(simulation.probe_columns(), ACCOUNTS), self.comm)
-        self.writer = FieldWriter(files.path, self.comm, _grid_info(simulation))
-        self.start = clock.perf_counter()
+        self._begin = clock.perf_counter()
         self.iterations: list[int] = []
         self.volume_error = 0.0
         self.probes: dict[str, float] = {}
-        self.last_checkpoint: Path | None = None
         self._slowest = 0.0
+
+    def open(self, after: int | None = None) -> None:
+        """Open what the run writes; of a run that goes on drop all after a step. Collective."""
+        simulation = self.simulation
+        self.history = History(self.files.history, column_names(simulation.probe_columns(), ACCOUNTS), self.comm)
+        self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
+        if after is not None:
+            self.history.truncate(after)
+            self.writer.truncate(after)
+
+    @contextmanager
+    def recorded(self) -> Iterator[None]:
+        """Leave a summary that says so when what is done inside fails, in whatever way. Not collective."""
+        first = self.comm.rank == 0
+        if first:
+            self.files.keep_reserve()
+        try:
+            yield
+        except BaseException as error:
+            if first:
+                self.files.free_reserve()
+                with suppress(OSError, SolveError):  # what has failed already is the message, not this
+                    write_summary(self.files.summary, self.summary("failed"), MPI.COMM_SELF)
+                self.console.log(f"failed: {error}")
+            raise
+        finally:
+            if first:
+                self.files.free_reserve()
 
     def loop(self, last: int, stop: Stop) -> int:
         """Step until ``last``; return the exit status. Collective."""
         simulation = self.simulation
-        try:
-            while simulation.step < last:
-                begin = clock.perf_counter()
-                simulation.advance()
-                with simulation.phase("observe"):
-                    self.observe(final=simulation.step == last)
-                self._slowest = max(self._slowest, clock.perf_counter() - begin)
-                outcome = simulation.outcome
-                self.console.step(
-                    simulation.step,
-                    simulation.time,
-                    simulation.dt,
-                    outcome.iterations,
-                    outcome.residual,
-                    clock.perf_counter() - begin,
-                )
-                why = stop.asked(self._slowest) if simulation.step < last else ""
-                if why:
-                    self.checkpoint()
-                    self.console.note(
-                        f"stopped by {why} after step {simulation.step}; go on with: petfsi resume {self.files.path}"
-                    )
-                    self.summarise("stopped")
-                    return STOPPED
-        except SolveError as error:
-            self.summarise("failed")
-            raise SolveError(self._story(error)) from None
+        while simulation.step < last:
+            begin = clock.perf_counter()
+            self.advance()
+            with simulation.phase("observe"):
+                self.observe(final=simulation.step == last)
+            seconds = clock.perf_counter() - begin
+            self._slowest = max(self._slowest, seconds)
+            outcome = simulation.outcome
+            self.console.step(
+                simulation.step, simulation.time, simulation.dt, outcome.iterations, outcome.residual, seconds
+            )
+            why = stop.asked(self._slowest) if simulation.step < last else ""
+            if why:
+                self.checkpoint()
+                self.summarise("stopped")
+                here = f"stopped by {why} after step {simulation.step}"
+                self.console.note(f"{here}; go on with: petfsi resume {self.files.path}")
+                return STOPPED
         self.checkpoint()
         self.summarise("done")
         return DONE
+
+    def advance(self) -> None:
+        """Take one step; what is wrong with the scene only now has become the step's failure. Collective."""
+        simulation = self.simulation
+        try:
+            # what overflows is found by those who judge the solve, and told by them
+            with np.errstate(all="ignore"):
+                simulation.advance()
+        except (SolveError, InputError) as error:
+            now = simulation.time + simulation.dt
+            last = checkpoints.last_good(self.files.checkpoints, self.comm)
+            raise SolveError(f"step {simulation.step + 1}, t = {now:.6g} s: {error}\n{last}") from error
 
     def observe(self, final: bool) -> None:
         """Write what is due after a step. Collective."""
@@ -157,7 +189,7 @@ class Run:
     def checkpoint(self) -> None:
         """Write a checkpoint, and let the solver forget what a resumed run could not know. Collective."""
         simulation = self.simulation
-        self.last_checkpoint = checkpoints.write_checkpoint(
+        checkpoints.write_checkpoint(
             self.files.checkpoints,
             simulation.step,
             simulation.time,
@@ -169,33 +201,29 @@ class Run:
         )
         simulation.solver.reset()
 
-    def summarise(self, status: Literal["done", "stopped", "failed"]) -> None:
+    def summarise(self, status: Status) -> None:
         """Write summary.json. Collective."""
+        write_summary(self.files.summary, self.summary(status), self.comm)
+
+    def summary(self, status: Status) -> Summary:
+        """Return what the run was so far. Not collective."""
         simulation = self.simulation
         iterations = self.iterations or [0]
-        summary = Summary(
+        return Summary(
             status=status,
             steps=simulation.step,
             time=simulation.time,
             ranks=self.comm.size,
             unknowns=simulation.system.unknowns,
-            wall_s=clock.perf_counter() - self.start,
+            wall_s=clock.perf_counter() - self._begin,
             phases=simulation.phases,
             iterations={"mean": float(np.mean(iterations)), "max": max(iterations)},
             assemblies=simulation.assemblies(),
             conservation={"volume_error": self.volume_error},
             probes=self.probes,
-            skipped=simulation.skipped(),
+            skipped=skipped(simulation.scene),
             versions=versions(),
         )
-        write_summary(self.files.summary, summary, self.comm)
-
-    def _story(self, error: SolveError) -> str:
-        simulation = self.simulation
-        last = (
-            f"Last good checkpoint: {self.last_checkpoint}." if self.last_checkpoint else "There is no checkpoint yet."
-        )
-        return f"step {simulation.step + 1}, t = {simulation.time + simulation.dt:.6g} s: {error}\n{last}"
 
 
 def _grid_info(simulation: Simulation) -> GridInfo | None:
@@ -228,18 +256,21 @@ def run_scene(
     Everything that can be wrong with the scene and the options is found before the directory is made.
     """
     comm = MPI.COMM_WORLD
-    solve.load_options(petsc_args, field_names(scene))
+    stop = Stop(comm, wall_limit)
+    solve.load_options(petsc_args)
     simulation = Simulation(comm, scene)
     unread = simulation.prepare()
     files = RunDirectory.create(out, dump_scene(scene), solve.dump_options(), overwrite, comm)
-    with Console(comm.rank, files.log, total=simulation.n_steps) as console:
+    last = scene.time.steps if steps is None else min(steps, scene.time.steps)
+    with Console(comm.rank, files.log, total=last) as console:
         _greet(console, simulation, unread)
         run = Run(simulation, files, console)
-        run.append_row()
-        if scene.output.every:
-            run.write_fields()
-        last = simulation.n_steps if steps is None else min(steps, simulation.n_steps)
-        return run.loop(last, Stop(comm, wall_limit))
+        with run.recorded():
+            run.open()
+            run.append_row()
+            if scene.output.every:
+                run.write_fields()
+            return run.loop(last, stop)
 
 
 def resume_run(
@@ -247,11 +278,12 @@ def resume_run(
 ) -> int:
     """Go on from a run's newest good checkpoint; return the exit status. Collective."""
     comm = MPI.COMM_WORLD
+    stop = Stop(comm, wall_limit)
     files = RunDirectory.open(directory, comm)
-    scene = load_scene(files.scene, sets, only=RESUMABLE)
-    solve.load_options(petsc_args, field_names(scene), base=files.options)
+    scene = from_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
+    solve.load_options(petsc_args, base=files.options)
     simulation = Simulation(comm, scene)
-    with Console(comm.rank, files.log, total=simulation.n_steps) as console:
+    with Console(comm.rank, files.log, total=scene.time.steps) as console:
         found = checkpoints.find_checkpoint(files.checkpoints, comm, console.warn)
         if found is None:
             raise InputError(
@@ -264,11 +296,10 @@ def resume_run(
         _greet(console, simulation, unread)
         console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
         run = Run(simulation, files, console)
-        run.last_checkpoint = found.path
-        run.history.truncate(found.step)
-        run.writer.truncate(found.step)
-        last = simulation.n_steps if steps is None else min(found.step + steps, simulation.n_steps)
-        return run.loop(last, Stop(comm, wall_limit))
+        last = scene.time.steps if steps is None else min(found.step + steps, scene.time.steps)
+        run.open(after=found.step)
+        with run.recorded():
+            return run.loop(last, stop)
 
 
 def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:

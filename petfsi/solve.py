@@ -14,7 +14,7 @@ from petfsi import petsc
 from petfsi.errors import InputError, SolveError
 from petfsi.system import System
 
-#: The coupled solve; a single field's own solve has the prefix that it has inside the coupled one.
+#: The solve of a step.
 PREFIX = "fsi_"
 DEFAULT = "monolithic.opts"
 
@@ -38,16 +38,15 @@ def shipped_options() -> list[Path]:
     return sorted(options_directory().glob("*.opts"))
 
 
-def load_options(args: list[str], fields: list[str], base: Path | None = None) -> None:
+def load_options(args: list[str], base: Path | None = None) -> None:
     """Fill PETSc's database: an options file, and the command line over it. Collective.
+
+    A ``pc_type`` on the command line takes the place of all that the file says about the preconditioner it replaces.
 
     Parameters
     ----------
     args : list of str
         PETSc options as given; ``-options_file`` may name a shipped file without its folder.
-    fields : list of str
-        The scene's fields. A single one reads nothing but the options under its own prefix and takes those of
-        ``monolithic.opts`` when the file has none.
     base : Path, optional
         The file used when the command line names none; ``monolithic.opts`` by default.
     """
@@ -56,7 +55,10 @@ def load_options(args: list[str], fields: list[str], base: Path | None = None) -
     words = iter(args)
     for word in words:
         if word == "-options_file":
-            files.append(Path(next(words, "")))
+            name = next(words, "")
+            if not name:
+                raise InputError("-options_file: wants the name of a file; petfsi's own are listed by 'petfsi info'")
+            files.append(Path(name))
         else:
             rest.append(word)
     for path in files or [base or default]:
@@ -65,14 +67,23 @@ def load_options(args: list[str], fields: list[str], base: Path | None = None) -
             shipped if not path.exists() and path.parent == Path(".") and shipped.exists() else path
         )
     database = PETSc.Options()
-    if len(fields) == 1 and not any(name.startswith(field_prefix(fields[0])) for name in database.getAll()):
-        petsc.insert_options(_lines_with_prefix(default, field_prefix(fields[0])))
+    _make_way(rest, database)
     petsc.insert_options(rest)
+    for name, value in database.getAll().items():
+        if name.startswith(PREFIX) and name.endswith(VALUED) and not value:
+            raise InputError(f"option -{name}: wants a value behind it")
 
 
-def _lines_with_prefix(path: Path, prefix: str) -> list[str]:
-    lines = [line.split("#")[0].split() for line in path.read_text().splitlines()]
-    return [word for words in lines if words and words[0].startswith("-" + prefix) for word in words]
+def _make_way(args: list[str], database: PETSc.Options) -> None:
+    """Drop a file's options of preconditioners that the command line replaces by another type: nothing reads them."""
+    stored = database.getAll()
+    for word, value in zip(args, [*args[1:], ""], strict=False):
+        name = word.lstrip("-")
+        if name.endswith("_pc_type") and stored.get(name) != value:
+            prefix = name.removesuffix("pc_type")
+            for old in stored:
+                if old.startswith(prefix) and not old.startswith((f"{prefix}ksp_", f"{prefix}mat_type")):
+                    database.delValue(old)
 
 
 def dump_options() -> str:
@@ -93,7 +104,9 @@ class Outcome:
 class Solver:
     """One KSP on the system's operator.
 
-    Its type, tolerances and everything inside come from PETSc options under ``fsi_``; see ``options/``.
+    Its type, tolerances and everything inside come from PETSc options under ``fsi_``; see ``options/``. A field
+    that is alone is solved as the options say for the whole, or, where they split the whole into fields, as they
+    say for that field.
 
     Attributes
     ----------
@@ -105,11 +118,15 @@ class Solver:
     def __init__(self, system: System) -> None:
         self.system = system
         single = len(system.fields) == 1
-        self.prefix = field_prefix(system.fields[0].name) if single else PREFIX
+        splits = PETSc.Options(PREFIX).getString("pc_type", "") == PETSc.PC.Type.FIELDSPLIT
+        self.prefix = field_prefix(system.fields[0].name) if single and splits else PREFIX
         options = PETSc.Options(self.prefix)
-        self.converts = options.getString("mat_type", "nest") == "aij" and not single
+        mat_type = options.getString("mat_type", "nest")
+        if not single and mat_type not in ("nest", "aij"):
+            raise InputError(f"option -{self.prefix}mat_type {mat_type}: must be nest or aij")
+        self.converts = mat_type == "aij" and not single
         split = options.getString("pc_fieldsplit_type", "multiplicative")
-        self.decoupled = not single and options.getString("pc_type", "") == "fieldsplit" and split != "schur"
+        self.decoupled = not single and splits and split != "schur"
         # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
         self.fixed_iterations = options.getString("ksp_convergence_test", "default") == "skip"
         self._ksp: PETSc.KSP | None = None
@@ -230,8 +247,9 @@ class Solver:
         except PETSc.Error as error:
             raise InputError(_option_story(self.prefix, error)) from None
         unread = petsc.unread_options(PREFIX)
-        if not self.system.index_sets:  # options of the coupled solve wait for a scene that couples
-            unread = [name for name in unread if name.startswith(self.prefix)]
+        if not self.system.index_sets:  # options of the others wait for a scene that couples
+            others = f"{PREFIX}fieldsplit_" if self.prefix == PREFIX else "-"
+            unread = [name for name in unread if name.startswith(self.prefix) and not name.startswith(others)]
         if unread:
             every = PETSc.Options().getAll()
             known = sorted(set(COMMON) | {n.removeprefix(self.prefix) for n in every if n not in unread})
@@ -244,6 +262,8 @@ class Solver:
         return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
 
 
+#: How the names of options end that mean nothing without a value.
+VALUED = ("_type", "_rtol", "_atol", "_divtol", "_max_it")
 #: Names worth suggesting for a misspelt option, besides those in force.
 COMMON = (
     "ksp_type ksp_rtol ksp_atol ksp_max_it ksp_monitor ksp_view ksp_pc_side ksp_norm_type "
@@ -259,4 +279,19 @@ def _petsc_text(error: PETSc.Error) -> str:
 
 
 def _option_story(prefix: str, error: PETSc.Error) -> str:
-    return f"options -{prefix}...: PETSc cannot set this solver up: {_petsc_text(error)} (code {error.ierr})"
+    text = _petsc_text(error).rstrip(".")
+    option = " or ".join(_options_meant(text, prefix)) or f"-{prefix}..."
+    hint = "; all of the matrix can be factorised with -fsi_mat_type aij" if "matrix type nest" in text else ""
+    return f"option {option}: PETSc cannot set this solver up: {text}{hint} (code {error.ierr})"
+
+
+def _options_meant(text: str, prefix: str) -> list[str]:
+    """Return the options that a PETSc message speaks of; most name the value only."""
+    words = {word.rstrip(".,") for word in text.split()}
+    values = PETSc.Options().getAll()
+    options = {f"-{name}": value for name, value in sorted(values.items()) if name.startswith(prefix)}
+    kind = next((f"_{kind.lower()}_type" for kind in ("KSP", "PC") if f"{kind} type" in text), "")
+    named = [name for name in options if name in words]
+    return [f"{name} {options[name]}" for name in named] or [
+        f"{name} {value}" for name, value in options.items() if value in words and name.endswith(kind)
+    ]

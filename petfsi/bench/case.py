@@ -15,7 +15,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import solve
-from petfsi.build import field_names
 from petfsi.errors import InputError
 from petfsi.geometry.meshes import from_root
 from petfsi.scene.load import apply_set, scene_from_dict
@@ -27,11 +26,10 @@ MONOLITHIC, SPLIT, ITERATED = "monolithic.opts", "split.opts", "split-iterated.o
 
 @dataclass(frozen=True)
 class Case:
-    """How a bench is run: on these ranks, in full or not, with files for its own use under ``out``."""
+    """How a bench is run: on these ranks, in full or not."""
 
     comm: MPI.Comm
     quick: bool
-    out: Path
 
 
 def job(comm: MPI.Comm, name: str, sets: dict[str, Any]) -> Scene:
@@ -67,14 +65,14 @@ def _put(data: Any, key: str, value: Any) -> None:
 
 
 @contextmanager
-def only_options(args: list[str], fields: list[str]) -> Iterator[None]:
+def only_options(args: list[str]) -> Iterator[None]:
     """Have these PETSc options of petfsi's, and no others, in force inside. Collective.
 
     Solvers read theirs when they are set up, some when they are first applied, so both must happen inside.
     """
     _clear()
     try:
-        solve.load_options(args, fields)
+        solve.load_options(args)
         yield
     finally:
         _clear()
@@ -90,7 +88,7 @@ def _clear() -> None:
 @contextmanager
 def simulation(comm: MPI.Comm, scene: Scene, options: str) -> Iterator[Simulation]:
     """Have a simulation of a scene, solved as a shipped options file says. Collective."""
-    with only_options(["-options_file", options], field_names(scene)):
+    with only_options(["-options_file", options]):
         sim = Simulation(comm, scene)
         sim.prepare()
         yield sim

@@ -4,6 +4,10 @@ The layer's foot is held and the water's top is open, so that the water moves as
 rho_s, L_s, M the layer's density, height and P-wave modulus and rho_f, L_f the water's, the angular frequency omega is
 
     x tan x = rho_s L_s / (rho_f L_f),    omega = (x / L_s) sqrt(M / rho_s).
+
+The ray transfer takes the pressure on the top from the centre of the first cell above, and so leaves half a cell of
+water out of the mass that the layer carries: first order in the mesh. The table gives what is left of the error
+against that shorter column, too.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from mpi4py import MPI
 
 from petfsi.bench import theory
@@ -32,8 +37,8 @@ PERIODS = 3
 SPEED = 1e-6
 
 LARGEST_ERROR = 0.02  # of the frequency on the finest mesh at FINE steps
-THEORY_ERROR = 0.01  # of the frequency at COARSE steps against that of the same mode at FINE ones
-DAMPING_ERROR = 0.03  # of the damping rate against Newmark's
+THEORY_ERROR = 1e-4  # of the frequency at COARSE steps against that of the same mode at FINE ones
+DAMPING_ERROR = 1e-3  # of the damping rate against Newmark's
 
 
 @dataclass(frozen=True)
@@ -45,26 +50,39 @@ class Column:
     wide: int = 4
 
     @property
+    def height(self) -> float:
+        """Of layer and water together, m."""
+        return SOLID_HEIGHT + FLUID_HEIGHT
+
+    @property
     def wave_number(self) -> float:
-        """x of the mode shape sin(x y / L_s)."""
+        """The x of the mode shape sin(x y / L_s)."""
         return theory.first_wave_number(self.ratio * SOLID_HEIGHT / FLUID_HEIGHT)
 
     @property
     def omega(self) -> float:
         """The exact angular frequency, rad/s."""
-        return self.wave_number / SOLID_HEIGHT * float(np.sqrt(MODULUS / (self.ratio * FLUID_DENSITY)))
+        return self._frequency(FLUID_HEIGHT)
+
+    @property
+    def omega_without_half_cell(self) -> float:
+        """The angular frequency under a column that lacks half a cell, rad/s."""
+        return self._frequency(FLUID_HEIGHT - 0.5 * self.height / self.cells)
+
+    def _frequency(self, fluid_height: float) -> float:
+        x = theory.first_wave_number(self.ratio * SOLID_HEIGHT / fluid_height)
+        return x / SOLID_HEIGHT * float(np.sqrt(MODULUS / (self.ratio * FLUID_DENSITY)))
 
     def scene(self, comm: MPI.Comm, dt: float) -> Scene:
         """Return the scene that starts in the first mode, water included. Collective."""
-        height = SOLID_HEIGHT + FLUID_HEIGHT
-        width = self.wide * height / self.cells
+        width = self.wide * self.height / self.cells
         x = self.wave_number
         sets = {
             "gravity": [0.0, 0.0],
             "time.dt": dt,
             "time.end": 1e4 * dt,
             "fluid.density": FLUID_DENSITY,
-            "fluid.size": [width, height],
+            "fluid.size": [width, self.height],
             "fluid.cells": [self.wide, self.cells],
             "fluid.initial.velocity": [0.0, SPEED * float(np.sin(x))],
             "solids.layer.shape.box.size": [width, SOLID_HEIGHT],
@@ -112,6 +130,7 @@ def _row(column: Column, study: str, dt: float, omega: float, damping: float) ->
         "omega": omega,
         "exact": column.omega,
         "error": omega / column.omega - 1,
+        "less half a cell": omega / column.omega_without_half_cell - 1,
         "damping": damping,
         "newmark damping": theory.newmark_observed(column.omega, dt)[1],
     }
@@ -174,6 +193,9 @@ def _picture(report: Report) -> Figure:
         damping.loglog(x, period * [r["newmark damping"] for r in two], "-", color=line.get_color(), lw=0.8)
     mesh.set(xlabel="cells along y", ylabel="relative error of the frequency", title="mesh")
     mesh.legend()
+    for axes, ticks in ((mesh, CELLS), (step, [1 / n for n in COARSE]), (damping, [1 / n for n in COARSE])):
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.xaxis.set_minor_locator(NullLocator())
     step.set(xlabel="dt / period", ylabel="relative error of the frequency", title="step (lines: theory)")
     damping.set(xlabel="dt / period", ylabel="damping rate x period", title="numerical damping (lines: theory)")
     return figure

@@ -85,7 +85,7 @@ def write_checkpoint(
     except OSError as error:
         files.on_root(comm, lambda: _discard(path))
         last = last_good(path.parent, comm)
-        why = files.reason(error, hdf5.n_bytes(arrays))
+        why = files.agreed_reason(comm, error, hdf5.n_bytes(arrays))
         raise SolveError(
             f"step {step}, t = {time:g} s: checkpoint {path} could not be written: {why}. {last}"
         ) from error

@@ -100,7 +100,8 @@ class FieldWriter:
 
     def _fail(self, what: str, error: OSError, needed: int) -> None:
         last = checkpoint.last_good(self.directory / "checkpoint", self.comm)
-        raise SolveError(f"{what}: {files.reason(error, needed)}. {last}") from error
+        why = files.agreed_reason(self.comm, error, needed)
+        raise SolveError(f"{what}: {why}. {last}") from error
 
     def _listed(self, shape: tuple[int, ...]) -> tuple[int, ...]:
         axes = len(self.grid.cells) if self.grid else 0

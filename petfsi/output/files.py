@@ -84,6 +84,11 @@ def reason(error: OSError, needed: int = 0) -> str:
     return text
 
 
+def agreed_reason(comm: MPI.Comm, error: OSError, needed: int = 0) -> str:
+    """Return ``reason`` as rank 0 sees it: the room on the disk changes while the ranks look. Collective."""
+    return on_root(comm, lambda: reason(error, needed))
+
+
 def megabytes(n: int) -> str:
     """Return a number of bytes in MB."""
     return f"{n / 1e6:.3g} MB"

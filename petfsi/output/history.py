@@ -6,6 +6,7 @@ import csv
 import errno
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +64,8 @@ class History:
             last = ""
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 last = " The run can be resumed from its last checkpoint once there is room."
-            raise SolveError(f"{self.path} could not be written: {files.reason(error)}.{last}") from error
+            why = files.agreed_reason(self.comm, error)
+            raise SolveError(f"{self.path} could not be written: {why}.{last}") from error
 
     def _rewrite(self, step: int | None) -> None:
         rows: list[list[str]] = []
@@ -79,10 +81,16 @@ class History:
             raise ValueError(f"a row of {self.path} has {sorted(row)} and should have {sorted(self.columns)}")
         text = ",".join(str(int(row[c])) if c in WHOLE else repr(float(row[c])) for c in self.columns)
         handle = os.open(self.path, os.O_WRONLY | os.O_APPEND)
+        size = os.fstat(handle).st_size
+        left = (text + "\n").encode()
         try:
-            # in one call to the system, so that a kill tears at most the last row
-            os.write(handle, (text + "\n").encode())
+            # in one call to the system, so that a kill tears at most the last row; a disk with room for a part of
+            # it takes that and refuses the rest
+            while left:
+                left = left[os.write(handle, left) :]
         except OSError as error:
+            with suppress(OSError):
+                os.ftruncate(handle, size)
             error.filename = str(self.path)
             raise
         finally:

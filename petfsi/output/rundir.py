@@ -17,7 +17,9 @@ from petfsi.output import files
 
 #: Marks a directory as a run: a scene and options alone may be somebody's own.
 MARKER = ".petfsi-run"
-_FILES = "scene.toml options.opts history.csv summary.json log.txt fields.xdmf solid.xdmf fluid.xdmf".split()
+#: Set aside while a run is under way, so that a full disk still takes its last words (bytes).
+RESERVE, RESERVE_BYTES = ".reserve", 16384
+_FILES = ".reserve scene.toml options.opts history.csv summary.json log.txt fields.xdmf solid.xdmf fluid.xdmf".split()
 _DIRECTORIES = {
     "fields": re.compile(r"(\d{6,}|mesh)\.h5(\.part)?"),
     "checkpoint": re.compile(r"\d{6,}\.(h5|json)(\.part)?"),
@@ -78,7 +80,8 @@ class RunDirectory:
             files.on_root(comm, lambda: run._create(scene_text, options_text, overwrite))
         except OSError as error:
             where = error.filename or path
-            raise InputError(f"run directory {path}: {where} cannot be written: {files.reason(error)}") from error
+            why = files.agreed_reason(comm, error)
+            raise InputError(f"run directory {path}: {where} cannot be written: {why}") from error
         return run
 
     @classmethod
@@ -88,6 +91,16 @@ class RunDirectory:
         if not files.on_root(comm, run._is_run):
             raise InputError(f"{path} is not the directory of a run: it has no {MARKER}")
         return run
+
+    def keep_reserve(self) -> None:
+        """Set a little room aside, where there is some. Rank 0 alone."""
+        with suppress(OSError):
+            (self.path / RESERVE).write_bytes(bytes(RESERVE_BYTES))
+
+    def free_reserve(self) -> None:
+        """Give that room back. Rank 0 alone."""
+        with suppress(OSError):
+            (self.path / RESERVE).unlink(missing_ok=True)
 
     def _is_run(self) -> bool:
         return (self.path / MARKER).is_file()
@@ -104,17 +117,19 @@ class RunDirectory:
                     "replace it with --overwrite, or name another"
                 )
             self._clear()
-        self.path.mkdir(parents=True, exist_ok=True)
+        made = [p for p in (self.path, *self.path.parents) if not p.exists()]
         try:
+            self.path.mkdir(parents=True, exist_ok=True)
             # first of all, so that what a crash leaves is still known to be ours
             files.replace_text(self.path / MARKER, json.dumps({"petfsi": petfsi.__version__}) + "\n")
             files.replace_text(self.scene, scene_text)
             files.replace_text(self.options, options_text)
         except OSError:
-            self._clear()
-            (self.path / MARKER).unlink(missing_ok=True)
             with suppress(OSError):
-                self.path.rmdir()
+                self._clear()
+                (self.path / MARKER).unlink(missing_ok=True)
+                for directory in made:
+                    directory.rmdir()
             raise
 
     def _clear(self) -> None:

@@ -76,7 +76,7 @@ def write_summary(path: Path, summary: Summary, comm: MPI.Comm) -> None:
     try:
         files.on_root(comm, write)
     except OSError as error:
-        raise SolveError(f"{path} could not be written: {files.reason(error)}") from error
+        raise SolveError(f"{path} could not be written: {files.agreed_reason(comm, error)}") from error
 
 
 def read_summary(path: Path) -> dict[str, Any]:

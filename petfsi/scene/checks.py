@@ -242,7 +242,8 @@ def _mesh_files(scene: Scene) -> Problems:
         for name, item in getattr(scene, table).items():
             mesh = item.shape.mesh
             if item.shape.kinds == ["mesh"] and not (scene.directory / mesh).is_file():
-                yield Problem(f"{table}.{name}.shape.mesh", mesh, "no such file")
+                # in full, where a value would be shortened: a file's name stands at the end
+                yield Problem(f"{table}.{name}.shape.mesh", ABSENT, f"no such file: {mesh}")
 
 
 def _obstacles(scene: Scene) -> Problems:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.errors import InputError
+from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import FluidField, Reader, Slab
 from petfsi.fields.mac import advect, kinds, pressure, views
 from petfsi.fields.mac.extrapolate import FAR, Band
@@ -18,6 +18,8 @@ from petfsi.scene.schema import Number, Scene
 
 #: Cells that the flow may cross in one sweep of the advection; the ghosts are this wide, and one more.
 MAX_COURANT = 4.0
+#: Times that it may cross the whole grid in one step; more is no flow any longer.
+MAX_CROSSINGS = 10
 
 
 class MacFluid(FluidField):
@@ -155,7 +157,7 @@ class MacFluid(FluidField):
         self.surroundings.prescribe(self.face_kind, self.boundary_velocity)
 
     def closed_regions(self, touched: np.ndarray | None) -> list[tuple[np.ndarray, bool]]:
-        """Return the connected regions of fluid without an OPEN face. Collective.
+        """Return the connected regions of fluid without an OPEN face, but for single cells. Collective.
 
         Parameters
         ----------
@@ -169,7 +171,12 @@ class MacFluid(FluidField):
             cells is touched.
         """
         if self._regions is None or self._regions[0] != self.geometry_version:
-            self._regions = (self.geometry_version, find_regions(self.grid, self._active, self.face_kind))
+            linked = np.zeros_like(self._active)
+            for axis in self._axes:
+                acts = np.isin(self.face_kind[axis], (kinds.PRESSURE, kinds.OPEN))
+                linked |= np.delete(acts, 0, axis) | np.delete(acts, -1, axis)
+            found = find_regions(self.grid, self._active & linked, self.face_kind)
+            self._regions = (self.geometry_version, found)
         regions = self._regions[1]
         return list(zip(regions.members, regions.touching(touched), strict=True))
 
@@ -181,7 +188,13 @@ class MacFluid(FluidField):
 
     def predict(self, time: float, dt: float) -> None:
         """Advect velocity and smoke, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
-        n = max(1, int(np.ceil(min(self.cfl(dt), 1e6) / MAX_COURANT)))
+        courant = self.cfl(dt)
+        if not courant <= MAX_CROSSINGS * max(self.grid.cells):
+            raise SolveError(
+                f"the flow has blown up: it would cross {courant:.1e} cells, more than the whole grid "
+                f"{MAX_CROSSINGS} times, in one step of {dt:g} s. Take a smaller dt, or look at what drives it."
+            )
+        n = max(1, int(np.ceil(courant / MAX_COURANT)))
         for axis in self._axes:
             self._advect(self.velocity[axis], self.velocity_star[axis], self._moved[axis], axis, dt, n)
         if self.smoke is not None and self._smoke_band is not None:

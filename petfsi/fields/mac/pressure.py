@@ -16,6 +16,10 @@ from petfsi.petsc import IntType
 #: Diagonal of rows that are not solved, as a part of the usual one: small, for the sake of multigrid.
 INACTIVE_DIAGONAL = 0.05
 
+#: The same for a fluid cell between solid faces alone. Nothing may push back on its pressure, if no point of the
+#: surface sees the cell; this much compressibility then keeps the system regular.
+POCKET_DIAGONAL = 1e-6
+
 
 class Pattern:
     """The 5- or 7-point pattern, the same for the whole run.
@@ -125,7 +129,11 @@ def laplacian(active, kind0, kind1, kind2, part, slot, c, values):
                         values[slot[row, 1 + 2 * a]] = -below[a]
                     if slot[row, 2 + 2 * a] >= 0:
                         values[slot[row, 2 + 2 * a]] = -above[a]
-                values[slot[row, 0]] = diagonal if active[i, j, k] else INACTIVE_DIAGONAL * usual
+                if not active[i, j, k]:
+                    diagonal = INACTIVE_DIAGONAL * usual
+                elif diagonal == 0.0:
+                    diagonal = POCKET_DIAGONAL * usual
+                values[slot[row, 0]] = diagonal
 
 
 @njit(cache=True)

@@ -1,0 +1,162 @@
+"""Whole runs through the command: schemes and ranks against each other, killed and resumed, and what is skipped."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from petfsi.output.history import read_history
+from petfsi.solve import shipped_options
+
+SCENES = Path(__file__).parent / "scenes"
+BAR = SCENES / "bar2d.toml"
+PETFSI = Path(sys.executable).with_name("petfsi")
+
+
+def command(*words, ranks=1):
+    launcher = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    return [*map(str, (*launcher, PETFSI, *words))]
+
+
+def petfsi(*words, ranks=1):
+    done = subprocess.run(command(*words, ranks=ranks), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def summary(directory):
+    return json.loads((directory / "summary.json").read_text())
+
+
+def last_output(directory):
+    """Every dataset of the last output and the last checkpoint, by name."""
+    arrays = {}
+    for folder in ("fields", "checkpoint"):
+        path = sorted((directory / folder).glob("[0-9]*.h5"))[-1]
+        with h5py.File(path) as file:
+            file.visititems(lambda name, item, folder=folder: arrays.update({f"{folder}/{name}": item[()]})
+                            if isinstance(item, h5py.Dataset) else None)
+    return arrays
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    """Run the bar to its end, never interrupted; by rank count and kept for the module."""
+    runs = {}
+
+    def run(ranks):
+        if ranks not in runs:
+            runs[ranks] = tmp_path_factory.mktemp("straight") / str(ranks)
+            petfsi("run", BAR, "--out", runs[ranks], ranks=ranks)
+        return runs[ranks]
+
+    return run
+
+
+def run_until_killed(directory, step, ranks):
+    """Start the bar and kill every process of it once that step is in the history."""
+    process = subprocess.Popen(
+        command("run", BAR, "--out", directory, ranks=ranks),
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )
+    history = directory / "history.csv"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        if history.exists() and history.read_text().count("\n") > step + 1:
+            break
+        time.sleep(0.005)
+    # mpirun gives its processes groups of their own
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split() if ranks > 1 else []
+    for pid in (process.pid, *map(int, children)):
+        os.kill(pid, signal.SIGKILL)
+    process.wait()
+    assert not (directory / "summary.json").exists(), "the run ended before it was killed"
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_killed_run_resumes_bit_for_bit(ranks, straight, tmp_path):
+    step = int(np.random.default_rng().integers(7, 25))
+    run_until_killed(tmp_path / "run", step, ranks)
+    petfsi("resume", tmp_path / "run", ranks=ranks)
+    want, got = last_output(straight(ranks)), last_output(tmp_path / "run")
+    assert want.keys() == got.keys()
+    different = [name for name in want if not np.array_equal(want[name], got[name])]
+    assert not different, f"killed after step {step}"
+    assert (straight(ranks) / "history.csv").read_bytes() == (tmp_path / "run" / "history.csv").read_bytes()
+
+
+def test_two_ranks_go_on_as_three(straight, tmp_path):
+    petfsi("run", BAR, "--out", tmp_path / "run", "--steps", 13, ranks=2)
+    petfsi("resume", tmp_path / "run", ranks=3)
+    want, got = last_output(straight(2)), last_output(tmp_path / "run")
+    for name in want:
+        np.testing.assert_allclose(got[name], want[name], rtol=0, atol=1e-8 * max(1.0, np.abs(want[name]).max()))
+
+
+def test_any_number_of_ranks_gives_the_same_history(tmp_path):
+    histories = []
+    for ranks in (1, 2, 3, 4):
+        options = ("-options_file", "monolithic-direct.opts", "--set", "output={}", "--steps", 12)
+        petfsi("run", BAR, "--out", tmp_path / str(ranks), *options, ranks=ranks)
+        histories.append(read_history(tmp_path / str(ranks) / "history.csv"))
+    for other in histories[1:]:
+        for name in ("tip.x", "tip.y"):
+            scale = np.abs(histories[0][name]).max()
+            np.testing.assert_allclose(other[name], histories[0][name], rtol=0, atol=1e-8 * scale)
+
+
+@pytest.mark.parametrize("options", shipped_options(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_every_option_of_a_shipped_file_is_read_and_the_answer_is_the_same(options, ranks, tmp_path):
+    # heavy enough for the iterated splitting to converge; an option that nothing reads would end the run
+    heavy = ("--set", "solids.bar.density=5000", "--set", "output={}", "--steps", 3)
+    petfsi("run", BAR, "--out", tmp_path / "run", *heavy, "-options_file", options, ranks=ranks)
+    petfsi("run", BAR, "--out", tmp_path / "direct", *heavy, "-options_file", "monolithic-direct.opts")
+    got, want = (read_history(tmp_path / name / "history.csv")["tip.x"][-1] for name in ("run", "direct"))
+    assert got == pytest.approx(want, rel=0.2 if options.stem == "split" else 1e-6)
+
+
+def test_a_tank_without_solids_has_no_nest_and_assembles_once(tmp_path):
+    code = "import sys; from petfsi.cli import main; status = main(sys.argv[1:]); print(*sys.modules); sys.exit(status)"
+    words = ("run", SCENES / "tank.toml", "--out", tmp_path / "run")
+    done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    modules = done.stdout.splitlines()[-1].split()
+    assert "petfsi.fields.mac.fluid" in modules
+    assert not [m for m in modules if m.startswith(("petfsi.fields.solid.", "petfsi.couplings.ray", "matplotlib"))]
+    told = summary(tmp_path / "run")
+    assert told["assemblies"] == {"pressure": 1}
+    assert told["unknowns"] == {"pressure": 1024}
+    assert any("no [solids]" in line for line in told["skipped"])
+    assert read_history(tmp_path / "run" / "history.csv")["divergence"].max() < 1e-8
+
+
+def test_a_solid_alone_has_no_fluid(tmp_path):
+    petfsi("run", SCENES / "beam.toml", "--out", tmp_path / "run")
+    told = summary(tmp_path / "run")
+    assert told["unknowns"].keys() == {"solid"}
+    assert any("no [fluid]" in line for line in told["skipped"])
+
+
+def test_a_solid_that_cannot_move_is_coupled_once(tmp_path):
+    hold = "solids.bar.supports=[{where='all', fix=['x', 'y']}]"
+    petfsi("run", BAR, "--out", tmp_path / "run", "--set", hold, "--steps", 5)
+    told = summary(tmp_path / "run")
+    assert told["assemblies"]["pressure"] == 1
+    assert told["assemblies"]["pressure-solid"] == 1
+
+
+def test_a_closed_cavity_keeps_its_volume(tmp_path):
+    scene = Path(__file__).parents[1] / "jobs" / "cavity.toml"
+    coarse = ("--set", "fluid.cells=[48, 40]", "--set", "solids.box.shape.box.cells=[24, 24]", "--set", "output={}")
+    petfsi("run", scene, "--out", tmp_path / "run", *coarse, "--steps", 20)
+    history = read_history(tmp_path / "run" / "history.csv")
+    assert np.abs(history["lid.y"]).max() > 1e-3  # it does move
+    assert history["volume_error"][1:].max() < 1e-9
