@@ -112,10 +112,10 @@ def run(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        from petfsi.geometry.meshes import from_root
+        from petfsi.ranks import on_root
         from petfsi.scene.load import load_scene
 
-        loaded = from_root(comm, lambda: load_scene(scene, sets))
+        loaded = on_root(comm, lambda: load_scene(scene, sets))
         _start_petsc(petsc)
         from petfsi.run import run_scene
 

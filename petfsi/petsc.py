@@ -11,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.output.files import on_root
+from petfsi.ranks import on_root
 
 IntType = PETSc.IntType
 

@@ -16,7 +16,6 @@ from mpi4py import MPI
 from petfsi import __version__, petsc, solve
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
-from petfsi.geometry.meshes import from_root
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
@@ -24,6 +23,7 @@ from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
 from petfsi.plan import skipped
+from petfsi.ranks import on_root
 from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
@@ -280,7 +280,7 @@ def resume_run(
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
     files = RunDirectory.open(directory, comm)
-    scene = from_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
+    scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
     solve.load_options(petsc_args, base=files.options)
     simulation = Simulation(comm, scene)
     with Console(comm.rank, files.log, total=scene.time.steps) as console:

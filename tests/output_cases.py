@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from processes import environment, launcher
 
 from petfsi.fields.base import Slab
 from petfsi.output.xdmf import GridInfo
@@ -115,7 +116,10 @@ def run_on(ranks: int, code: str, directory: Path) -> subprocess.CompletedProces
     if MPI.COMM_WORLD.size > 1:
         pytest.skip("mpirun does not start under mpirun")
     text = PREAMBLE.format(tests=os.path.dirname(__file__), directory=str(directory)) + code
-    start = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
-    allow = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_"))} | allow
-    return subprocess.run([*start, sys.executable, "-c", text], capture_output=True, text=True, timeout=60, env=clean)
+    return subprocess.run(
+        [*launcher(ranks), sys.executable, "-c", text],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment(),
+    )

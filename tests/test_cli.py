@@ -1,5 +1,4 @@
 import io
-import os
 import subprocess
 import sys
 import types
@@ -8,6 +7,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from processes import environment, launcher
 
 from petfsi import __version__, cli
 from petfsi.console import Console
@@ -65,12 +65,9 @@ def fail_with(monkeypatch, error):
 
 def petfsi(*args, ranks=0, code=None, **variables):
     """Run petfsi, or a piece of Python, as a user does: in a process of its own."""
-    env = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_MCA", "OMPI_COMM", "PMIX", "ORTE"))}
-    env |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"} | variables
-    launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
     what = ["-c", code] if code else ["-m", "petfsi.cli"]
-    command = [*launcher, sys.executable, *what, *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60)
+    command = [*launcher(ranks), sys.executable, *what, *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment(**variables), timeout=60)
 
 
 # ---- what is passed on --------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+from processes import environment, launcher
 
 from petfsi import cli
 from petfsi.output.history import read_history
@@ -60,17 +61,6 @@ def scene(tmp_path, monkeypatch):
     path = tmp_path / "block.toml"
     path.write_text(SCENE)
     return path
-
-
-def environment():
-    """Return the environment of a user: pytest's own process may have started MPI."""
-    env = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX", "ORTE", "PETSC"))}
-    env |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"}
-    return env | {"OMPI_MCA_mpi_yield_when_idle": "1"}  # a rank that waits leaves the core to one that works
-
-
-def launcher(ranks):
-    return ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
 
 
 def petfsi(*words, ranks=1, file_limit=None):

@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from processes import environment, launcher
 
 from petfsi.output.history import read_history
 from petfsi.solve import shipped_options
@@ -21,12 +22,11 @@ PETFSI = Path(sys.executable).with_name("petfsi")
 
 
 def command(*words, ranks=1):
-    launcher = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
-    return [*map(str, (*launcher, PETFSI, *words))]
+    return [*map(str, (*launcher(ranks), PETFSI, *words))]
 
 
 def petfsi(*words, ranks=1):
-    done = subprocess.run(command(*words, ranks=ranks), capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command(*words, ranks=ranks), capture_output=True, text=True, timeout=300, env=environment())
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -41,8 +41,11 @@ def last_output(directory):
     for folder in ("fields", "checkpoint"):
         path = sorted((directory / folder).glob("[0-9]*.h5"))[-1]
         with h5py.File(path) as file:
-            file.visititems(lambda name, item, folder=folder: arrays.update({f"{folder}/{name}": item[()]})
-                            if isinstance(item, h5py.Dataset) else None)
+            file.visititems(
+                lambda name, item, folder=folder: (
+                    arrays.update({f"{folder}/{name}": item[()]}) if isinstance(item, h5py.Dataset) else None
+                )
+            )
     return arrays
 
 
@@ -64,7 +67,9 @@ def run_until_killed(directory, step, ranks):
     """Start the bar and kill every process of it once that step is in the history."""
     process = subprocess.Popen(
         command("run", BAR, "--out", directory, ranks=ranks),
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=environment(),
     )
     history = directory / "history.csv"
     deadline = time.monotonic() + 120
@@ -72,9 +77,9 @@ def run_until_killed(directory, step, ranks):
         if history.exists() and history.read_text().count("\n") > step + 1:
             break
         time.sleep(0.005)
-    # mpirun gives its processes groups of their own
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split() if ranks > 1 else []
-    for pid in (process.pid, *map(int, children)):
+    # mpirun gives its ranks process groups of their own
+    ranks_of = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+    for pid in (process.pid, *(map(int, ranks_of) if ranks > 1 else ())):
         os.kill(pid, signal.SIGKILL)
     process.wait()
     assert not (directory / "summary.json").exists(), "the run ended before it was killed"
@@ -114,19 +119,23 @@ def test_any_number_of_ranks_gives_the_same_history(tmp_path):
 
 @pytest.mark.parametrize("options", shipped_options(), ids=lambda path: path.stem)
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_every_option_of_a_shipped_file_is_read_and_the_answer_is_the_same(options, ranks, tmp_path):
-    # heavy enough for the iterated splitting to converge; an option that nothing reads would end the run
+def test_every_option_of_a_shipped_file_is_read_and_converged_schemes_agree(options, ranks, tmp_path):
+    # an option that nothing reads would end the run; so heavy a bar lets the iterated splitting converge
     heavy = ("--set", "solids.bar.density=5000", "--set", "output={}", "--steps", 3)
     petfsi("run", BAR, "--out", tmp_path / "run", *heavy, "-options_file", options, ranks=ranks)
+    if options.stem == "split":
+        return  # its answer is another one: see test_splitting
     petfsi("run", BAR, "--out", tmp_path / "direct", *heavy, "-options_file", "monolithic-direct.opts")
     got, want = (read_history(tmp_path / name / "history.csv")["tip.x"][-1] for name in ("run", "direct"))
-    assert got == pytest.approx(want, rel=0.2 if options.stem == "split" else 1e-6)
+    assert got == pytest.approx(want, rel=1e-6)
 
 
 def test_a_tank_without_solids_has_no_nest_and_assembles_once(tmp_path):
     code = "import sys; from petfsi.cli import main; status = main(sys.argv[1:]); print(*sys.modules); sys.exit(status)"
     words = ("run", SCENES / "tank.toml", "--out", tmp_path / "run")
-    done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, timeout=300, env=environment()
+    )
     assert done.returncode == 0, done.stderr
     modules = done.stdout.splitlines()[-1].split()
     assert "petfsi.fields.mac.fluid" in modules
@@ -135,7 +144,7 @@ def test_a_tank_without_solids_has_no_nest_and_assembles_once(tmp_path):
     assert told["assemblies"] == {"pressure": 1}
     assert told["unknowns"] == {"pressure": 1024}
     assert any("no [solids]" in line for line in told["skipped"])
-    assert read_history(tmp_path / "run" / "history.csv")["divergence"].max() < 1e-8
+    assert read_history(tmp_path / "run" / "history.csv")["divergence"][1:].max() < 1e-8
 
 
 def test_a_solid_alone_has_no_fluid(tmp_path):

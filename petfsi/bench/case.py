@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 from petfsi import solve
 from petfsi.errors import InputError
-from petfsi.geometry.meshes import from_root
+from petfsi.ranks import on_root
 from petfsi.scene.load import apply_set, scene_from_dict
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
@@ -54,7 +54,7 @@ def job(comm: MPI.Comm, name: str, sets: dict[str, Any]) -> Scene:
             _put(data, key, copy.deepcopy(value))
         return scene_from_dict(data, path.parent)
 
-    return from_root(comm, read)
+    return on_root(comm, read)
 
 
 def _put(data: Any, key: str, value: Any) -> None:

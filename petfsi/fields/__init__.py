@@ -1,0 +1,1 @@
+"""The physical parts: fluids and solids, each with its unknowns, block and state."""

@@ -6,11 +6,10 @@ import contextlib
 import io
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,7 +20,7 @@ from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signe
 from petfsi.scene.schema import Box, Shape, Solid
 
 if TYPE_CHECKING:  # meshes can be checked without starting MPI
-    from mpi4py import MPI
+    pass
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -61,21 +60,6 @@ class SimplexMesh:
             np.concatenate([cells + offset for (_, cells), offset in zip(meshes, offsets[:-1], strict=True)]),
             np.repeat(np.arange(len(meshes)), [len(cells) for _, cells in meshes]),
         )
-
-
-def from_root(comm: MPI.Comm, make: Callable[[], T]) -> T:
-    """Return what rank 0 makes, on all ranks; an InputError there is raised on all. Collective."""
-    result: T | None = None
-    message: str | None = None
-    if comm.rank == 0:
-        try:
-            result = make()
-        except InputError as error:
-            message = str(error)
-    result, message = comm.bcast((result, message))
-    if message is not None:
-        raise InputError(message)
-    return cast(T, result)
 
 
 def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ import petfsi
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Reader, Slab
 from petfsi.output import files, hdf5
+from petfsi.ranks import on_root
 
 #: Of the layout of a checkpoint; raised when an older petfsi could not read it.
 FORMAT = 1
@@ -79,17 +80,17 @@ def write_checkpoint(
     arrays = {f"{group}/{name}": slab for group, slabs in groups.items() for name, slab in slabs.items()}
     about = {"step": step, "time": time, "dt": dt, "attributes": dict(attributes)}
     try:
-        files.on_root(comm, lambda: _prepare(path.parent))
+        on_root(comm, lambda: _prepare(path.parent))
         hdf5.write_file(files.part_of(path), arrays, about, comm)
-        files.on_root(comm, lambda: _commit(path, step, time, comm.size))
+        on_root(comm, lambda: _commit(path, step, time, comm.size))
     except OSError as error:
-        files.on_root(comm, lambda: _discard(path))
+        on_root(comm, lambda: _discard(path))
         last = last_good(path.parent, comm)
         why = files.agreed_reason(comm, error, hdf5.n_bytes(arrays))
         raise SolveError(
             f"step {step}, t = {time:g} s: checkpoint {path} could not be written: {why}. {last}"
         ) from error
-    files.on_root(comm, lambda: _prune(path.parent, step, keep))
+    on_root(comm, lambda: _prune(path.parent, step, keep))
     return path
 
 
@@ -202,7 +203,7 @@ def find_checkpoint(directory: Path, comm: MPI.Comm, report: Callable[[str], Non
             damaged.append(f"checkpoint {Path(directory) / f'{number:06d}.h5'} is damaged: {found}")
         return None, damaged
 
-    info, damaged = files.on_root(comm, look)
+    info, damaged = on_root(comm, look)
     if comm.rank == 0:
         for line in damaged:
             report(line)

@@ -15,6 +15,7 @@ from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
 from petfsi.output import checkpoint, files, hdf5, xdmf
 from petfsi.output.xdmf import Arrays, Entry, GridInfo
+from petfsi.ranks import on_root
 
 #: Arrays of the solid that never change and are stored once.
 STATIC = ("points", "cells", "body")
@@ -42,7 +43,7 @@ class FieldWriter:
         self._mesh = self.directory / "fields" / "mesh.h5"
         self._static: Arrays = {}
         self._entries: list[Entry] = []
-        self._static, self._entries = files.on_root(comm, self._find)
+        self._static, self._entries = on_root(comm, self._find)
 
     @property
     def times(self) -> list[float]:
@@ -77,15 +78,15 @@ class FieldWriter:
         about = {"step": step, "time": time}
         needed = hdf5.n_bytes(arrays)
         try:
-            files.on_root(self.comm, lambda: path.parent.mkdir(exist_ok=True))
+            on_root(self.comm, lambda: path.parent.mkdir(exist_ok=True))
             if not self._static:
                 self._write_mesh(solid)
             part = files.part_of(path)
             hdf5.write_file(part, arrays, about, self.comm, views)
             entry = Entry(step, time, f"fields/{path.name}", _described(arrays, views))
             self._entries = sorted([*(e for e in self._entries if e.step != step), entry], key=lambda e: e.step)
-            files.on_root(self.comm, lambda: files.publish(part, path))
-            files.on_root(self.comm, self._index)
+            on_root(self.comm, lambda: files.publish(part, path))
+            on_root(self.comm, self._index)
         except OSError as error:
             self._fail(f"step {step}, t = {time:g} s: fields {path} could not be written", error, needed)
         return path
@@ -94,7 +95,7 @@ class FieldWriter:
         """Drop the output after a step, and what an interrupted write left."""
         self._entries = [entry for entry in self._entries if entry.step <= step]
         try:
-            files.on_root(self.comm, self._remove_others)
+            on_root(self.comm, self._remove_others)
         except OSError as error:
             self._fail(f"{self.directory}: output after step {step} could not be removed", error, 0)
 
@@ -114,7 +115,7 @@ class FieldWriter:
         about = {} if self.grid is None else {k: list(getattr(self.grid, k)) for k in ("origin", "spacing", "cells")}
         part = files.part_of(self._mesh)
         hdf5.write_file(part, arrays, about, self.comm)
-        files.on_root(self.comm, lambda: files.publish(part, self._mesh))
+        on_root(self.comm, lambda: files.publish(part, self._mesh))
         self._static = _described(arrays, {})
 
     def _index(self) -> None:

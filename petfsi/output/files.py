@@ -1,38 +1,15 @@
-"""Work on files that one rank does for all, and files that change in one piece."""
+"""Files that change in one piece, and why they cannot."""
 
 from __future__ import annotations
 
 import errno
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 from mpi4py import MPI
 
-T = TypeVar("T")
-
-
-def on_root(comm: MPI.Comm, work: Callable[[], T]) -> T:
-    """Return on every rank what ``work`` returns on rank 0, or raise there what it raises. Collective."""
-    result, failure = None, None
-    if comm.rank == 0:
-        try:
-            result = work()
-        except Exception as error:  # noqa: BLE001 - a rank that raised alone would leave the others waiting
-            failure = error
-    result, failure = comm.bcast((result, failure))
-    if failure is not None:
-        raise failure
-    return result
-
-
-def agree(comm: MPI.Comm, failure: OSError | None) -> None:
-    """Raise the failure of the lowest rank that has one on every rank. Collective."""
-    failures = [f for f in comm.allgather(failure) if f is not None]
-    if failures:
-        raise failures[0]
+from petfsi.ranks import on_root
 
 
 def sync_directory(path: Path) -> None:

@@ -28,7 +28,7 @@ from mpi4py import MPI
 
 from petfsi.errors import PetfsiError
 from petfsi.fields.base import Slab
-from petfsi.output.files import agree, on_root
+from petfsi.ranks import agree, on_root
 
 #: Room for the file's own tables, beyond the data: in all, and for every dataset.
 _TABLES, _TABLES_EACH = 65536, 4096

@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output import files
+from petfsi.ranks import on_root
 
 #: The columns that hold whole numbers.
 WHOLE = ("step", "iterations")
@@ -59,7 +60,7 @@ class History:
 
     def _on_root(self, work: Callable[[], None]) -> None:
         try:
-            files.on_root(self.comm, work)
+            on_root(self.comm, work)
         except OSError as error:
             last = ""
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):

@@ -14,6 +14,7 @@ from mpi4py import MPI
 import petfsi
 from petfsi.errors import InputError
 from petfsi.output import files
+from petfsi.ranks import on_root
 
 #: Marks a directory as a run: a scene and options alone may be somebody's own.
 MARKER = ".petfsi-run"
@@ -77,7 +78,7 @@ class RunDirectory:
         """
         run = cls(Path(path))
         try:
-            files.on_root(comm, lambda: run._create(scene_text, options_text, overwrite))
+            on_root(comm, lambda: run._create(scene_text, options_text, overwrite))
         except OSError as error:
             where = error.filename or path
             why = files.agreed_reason(comm, error)
@@ -88,7 +89,7 @@ class RunDirectory:
     def open(cls, path: Path, comm: MPI.Comm) -> RunDirectory:
         """Return an existing run. Collective; InputError on all ranks if it is none."""
         run = cls(Path(path))
-        if not files.on_root(comm, run._is_run):
+        if not on_root(comm, run._is_run):
             raise InputError(f"{path} is not the directory of a run: it has no {MARKER}")
         return run
 

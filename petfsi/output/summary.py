@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petfsi.errors import InputError, SolveError
 from petfsi.output import files
 from petfsi.output.hdf5 import plain
+from petfsi.ranks import on_root
 
 
 @dataclass
@@ -74,7 +75,7 @@ def write_summary(path: Path, summary: Summary, comm: MPI.Comm) -> None:
         files.replace_text(Path(path), json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
     try:
-        files.on_root(comm, write)
+        on_root(comm, write)
     except OSError as error:
         raise SolveError(f"{path} could not be written: {files.agreed_reason(comm, error)}") from error
 

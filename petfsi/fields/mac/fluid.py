@@ -11,8 +11,9 @@ from petfsi.fields.mac import advect, kinds, pressure, views
 from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
-from petfsi.fields.mac.sides import Surroundings, agreed, evaluate_at, periodic_axes, wrapped_points
+from petfsi.fields.mac.sides import Surroundings, evaluate_at, periodic_axes, wrapped_points
 from petfsi.petsc import new_block, set_csr
+from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene
 
@@ -346,11 +347,14 @@ class MacFluid(FluidField):
 
     def output(self) -> dict[str, Slab]:
         """Return cell-centred velocity (.., dim), pressure, kind and smoke of this rank's cells."""
-        return views.output(self)
+        return views.output(self._view())
 
     def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
         """Return ``velocity``, ``pressure`` or ``smoke`` at a point, interpolated among fluid cells. Collective."""
-        return views.probe(self, quantity, at)
+        return views.probe(self._view(), quantity, at)
+
+    def _view(self) -> views.View:
+        return views.View(self.grid, self.cell_kind, self.velocity, self.pressure, self.smoke)
 
     # ---- checkpoint -------------------------------------------------------------------------------------------
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TypeVar
 
 import numpy as np
-from mpi4py import MPI
 
 from petfsi.errors import InputError
 from petfsi.fields.mac import kinds
 from petfsi.fields.mac.grid import MacGrid
 from petfsi.geometry.shapes import inside
+from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Inflow, InflowSide, Obstacle, Shape, Side, Sides
 
@@ -50,19 +49,6 @@ def evaluate_at(expression: Expression, points: np.ndarray, time: float) -> np.n
     """Return an expression's values at points (n, dim); z = 0 in 2D."""
     columns = dict(zip("xyz", points.T, strict=False))
     return expression(t=time, **{name: columns.get(name, np.zeros(len(points))) for name in "xyz"})
-
-
-def agreed(comm: MPI.Comm, call: Callable[[], T]) -> T:
-    """Return what ``call`` returns; if it raises an ``InputError`` on any rank, raise that on all. Collective."""
-    result, message = None, None
-    try:
-        result = call()
-    except InputError as error:
-        message = str(error)
-    message = next((m for m in comm.allgather(message) if m is not None), None)
-    if message is not None:
-        raise InputError(message)
-    return cast(T, result)
 
 
 def ramp(time: float, duration: float) -> float:
@@ -200,6 +186,6 @@ def _covered_cells(grid: MacGrid, shape: Shape, key: str, directory: Path) -> np
         return inside(shape, wrapped_points(grid, None, index)).reshape(grid.owned_shape)
     from petfsi.geometry import meshes, rays
 
-    points, facets = meshes.from_root(grid.comm, lambda: meshes.read_surface(shape, grid.dim, key, directory))
+    points, facets = on_root(grid.comm, lambda: meshes.read_surface(shape, grid.dim, key, directory))
     lines = [grid.cell_centres(b)[part] for b, part in enumerate(grid.owned(None))]
     return rays.inside_mask(points, facets, lines).astype(bool)

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
 from petfsi.errors import InputError
 from petfsi.fields.base import Slab
 from petfsi.fields.mac.advect import velocity_at
-from petfsi.fields.mac.grid import three
+from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.kinds import FLUID
 
-if TYPE_CHECKING:
-    from petfsi.fields.mac.fluid import MacFluid
+
+@dataclass(frozen=True)
+class View:
+    """A fluid's arrays, as they are at this moment."""
+
+    grid: MacGrid
+    cell_kind: np.ndarray
+    velocity: list[np.ndarray]
+    pressure: np.ndarray
+    smoke: np.ndarray | None
 
 
-def output(fluid: MacFluid) -> dict[str, Slab]:
+def output(fluid: View) -> dict[str, Slab]:
     """Return cell-centred ``velocity`` (.., dim; zero outside the fluid), ``pressure``, ``kind`` and ``smoke``."""
     grid = fluid.grid
     part = grid.owned(None)
@@ -33,7 +41,7 @@ def output(fluid: MacFluid) -> dict[str, Slab]:
     return slabs
 
 
-def probe(fluid: MacFluid, quantity: str, at: list[float]) -> float | np.ndarray:
+def probe(fluid: View, quantity: str, at: list[float]) -> float | np.ndarray:
     """Return a quantity at a point, the same on all ranks; not a number where no fluid is near. Collective."""
     grid = fluid.grid
     if quantity not in ("velocity", "pressure") and (quantity != "smoke" or fluid.smoke is None):
@@ -49,7 +57,7 @@ def probe(fluid: MacFluid, quantity: str, at: list[float]) -> float | np.ndarray
     return grid.comm.bcast(value, root=owner)
 
 
-def _value(fluid: MacFluid, quantity: str, place: np.ndarray) -> float | np.ndarray:
+def _value(fluid: View, quantity: str, place: np.ndarray) -> float | np.ndarray:
     """Return a quantity at a point (in cells from the grid's corner) in one of this rank's cells."""
     grid = fluid.grid
     s = np.full(3, 0.5)

@@ -16,10 +16,11 @@ from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.probes import Place, locate
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.bodies import build_bodies
-from petfsi.geometry.meshes import SimplexMesh, from_root
+from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.surfaces import Surface, boundary_facets, shells
 from petfsi.integrators import INTEGRATORS, Coefficients, Integrator
 from petfsi.petsc import IntType, Layout, new_block, set_csr
+from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene, Solid
 
@@ -46,7 +47,7 @@ class SimplexSolid(SolidField):
         self.comm = comm
         self.dim: int = scene.dim
         self.names = list(scene.solids)
-        mesh = from_root(comm, lambda: _union(scene))
+        mesh = on_root(comm, lambda: _union(scene))
         self.extent = float(np.ptp(mesh.points, axis=0).max())
         node_body = np.empty(len(mesh.points), dtype=np.int32)
         node_body[mesh.cells] = mesh.body[:, None]
