@@ -48,9 +48,13 @@ def solve(fluid):
         ksp.getPC().setType("hypre")
         ksp.setTolerances(rtol=1e-14, atol=1e-14, max_it=100)
     else:
+        # on every rank the whole matrix: ranks that share two cores factor it together at a crawl
         ksp.setType("preonly")
-        ksp.getPC().setType("cholesky")
-        ksp.getPC().setFactorSolverType("mumps")
+        options = PETSc.Options("cases_")
+        options["pc_type"], options["redundant_pc_type"] = "redundant", "cholesky"
+        options["redundant_pc_factor_mat_solver_type"] = "mumps"
+        ksp.setOptionsPrefix("cases_")
+        ksp.setFromOptions()
     ksp.solve(b, x)
     return x.array * fluid.col_scale
 

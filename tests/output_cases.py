@@ -108,7 +108,15 @@ sys.path.insert(0, {tests!r})
 from output_cases import *
 from petfsi.errors import PetfsiError
 comm, directory = MPI.COMM_WORLD, Path({directory!r})
+
 """
+
+
+def say(text: str) -> None:
+    """Print a line for every rank, on rank 0: what ranks print themselves arrives interleaved."""
+    lines = MPI.COMM_WORLD.gather(text)
+    if MPI.COMM_WORLD.rank == 0:
+        print(*lines, sep="\n")
 
 
 def run_on(ranks: int, code: str, directory: Path) -> subprocess.CompletedProcess:

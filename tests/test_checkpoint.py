@@ -24,7 +24,9 @@ def write(directory, step, keep=3, whole=None, on=comm):
 
 def names(directory):
     comm.barrier()
-    return sorted(p.name for p in directory.iterdir())
+    found = sorted(p.name for p in directory.iterdir())
+    comm.barrier()  # before anyone goes on to change what others still look at
+    return found
 
 
 def find(directory):
@@ -211,7 +213,7 @@ first = write(5, 10)
 try:
     write(10, 1_000_000)
 except PetfsiError as error:
-    print(f"rank {{comm.rank}} exit {{error.exit_code}}: {{error}}", flush=True)
+    say(f"rank {{comm.rank}} exit {{error.exit_code}}: {{error}}")
 comm.barrier()
 assert sorted(p.name for p in directory.iterdir()) == ["000005.h5", "000005.json"]
 comm.barrier()

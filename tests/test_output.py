@@ -159,7 +159,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, resource.RLIM_INFINITY))
 try:
     writer.write(5, 0.5, output(2, 0.5, comm))
 except PetfsiError as error:
-    print(f"rank {comm.rank} exit {error.exit_code}: {error}", flush=True)
+    say(f"rank {comm.rank} exit {error.exit_code}: {error}")
 """
     done = run_on(ranks, code, tmp_path)
     assert done.returncode == 0, done.stderr

@@ -90,7 +90,10 @@ class ExpressionError(InputError):
 
     def __init__(self, label: str, reason: str) -> None:
         super().__init__(f"{label}: {reason}")
-        self.reason = reason
+        self.label, self.reason = label, reason
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.label, self.reason)  # for the other ranks
 
 
 class _Refused(Exception):
