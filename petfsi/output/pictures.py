@@ -258,12 +258,11 @@ def _space_figure(stage: _Stage, frame: _Frame) -> Figure:
             polygons, owners = cut_tetrahedra(frame.points, stage.cells, axis, middle[axis])
             _draw_polygons(ax, polygons, _body_colours(stage)[owners], len(polygons) * 3 >= _MANY_EDGES)
         _finish(ax, stage, across)
-        ax.set_title(f"{'xyz'[axis]} = {middle[axis]:.3g} m", fontsize="medium")
+        ax.set_title(f"t = {frame.time:.4g} s, {'xyz'[axis]} = {middle[axis]:.3g} m", fontsize="medium")
     if frame.points is not None:
         _draw_surface(figure.add_subplot(places[0, 2], projection="3d"), stage, frame.points)
     if mappable:
         figure.colorbar(mappable, ax=panels, label=_SHOWN[stage.shown][0], shrink=0.6, location="bottom", aspect=50)
-    figure.suptitle(f"t = {frame.time:.4g} s", fontsize="large")
     return figure
 
 
