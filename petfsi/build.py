@@ -21,11 +21,6 @@ def _class(place: str) -> type:
     return getattr(import_module(module), name)
 
 
-def field_names(scene: Scene) -> list[str]:
-    """Return the names of the fields a scene has, in the order of the nest."""
-    return ["solid"] * bool(scene.solids) + ["pressure"] * (scene.fluid is not None)
-
-
 def build_fields(comm: MPI.Comm, scene: Scene) -> list[Field]:
     """Return the scene's fields, in the order of the nest: solid, pressure. Collective."""
     fields: list[Field] = []
