@@ -201,7 +201,7 @@ def test_three_ranks_write_what_two_read(tmp_path):
             for name, array in arrays.items():
                 piece = cut(array, comm, axis=array.ndim - 1)
                 assert np.array_equal(saved.group(group)(name, piece.start, piece.data.shape), piece.data)
-    print("same")
+    say("same")
     """
     done = run(code, tmp_path, 2)
     assert done.stdout.split() == ["same"] * 2, done.stderr
