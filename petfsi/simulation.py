@@ -128,7 +128,7 @@ class Simulation:
             raise SolveError(
                 f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
                 f"in one step of {self.dt:g} s. A splitting scheme fails like this where the fluid that moves with the "
-                f"solid outweighs it, at small steps most of all: try monolithic.opts. Else more damping or a smaller dt."
+                f"solid outweighs it, at small steps most of all: try monolithic.opts. Else more damping, a smaller dt."
             )
 
     def probe_columns(self) -> list[str]:
