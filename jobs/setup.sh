@@ -43,7 +43,7 @@ from_debian = ("petsc4py", "mpi4py", "h5py", "scipy")
 wanted = project["dependencies"] + project["optional-dependencies"]["test"]
 print("\n".join(w for w in wanted if not w.startswith(from_debian)))
 PY
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -r .venv/requirements.txt
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check wheel -r .venv/requirements.txt
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
     echo "$wanted" > "$stamp"
 fi
