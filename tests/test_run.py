@@ -1,5 +1,6 @@
 """Whole runs through the command: schemes and ranks against each other, killed and resumed, and what is skipped."""
 
+import contextlib
 import json
 import os
 import signal
@@ -63,6 +64,16 @@ def straight(tmp_path_factory):
     return run
 
 
+def children(parent):
+    """Return the processes whose parent this one is (as /proc says)."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(stat.parent.name))
+    return found
+
+
 def run_until_killed(directory, step, ranks):
     """Start the bar and kill every process of it once that step is in the history."""
     process = subprocess.Popen(
@@ -78,8 +89,7 @@ def run_until_killed(directory, step, ranks):
             break
         time.sleep(0.005)
     # mpirun gives its ranks process groups of their own
-    ranks_of = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
-    for pid in (process.pid, *(map(int, ranks_of) if ranks > 1 else ())):
+    for pid in (process.pid, *children(process.pid)):
         os.kill(pid, signal.SIGKILL)
     process.wait()
     assert not (directory / "summary.json").exists(), "the run ended before it was killed"
