@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import FluidField, Reader, Slab
 from petfsi.fields.mac import advect, kinds, pressure, views
+from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, evaluate_at, periodic_axes, wrapped_points
 from petfsi.petsc import new_block, set_csr
-from petfsi.ranks import agreed
+from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene
+
+if TYPE_CHECKING:
+    from petfsi.fields.mac.cut import Walls
+    from petfsi.fields.mac.cutgrid import CutGrid, Openings
 
 #: Cells that the flow may cross in one sweep of the advection; the ghosts are this wide, and one more.
 MAX_COURANT = 4.0
@@ -62,8 +69,10 @@ class MacFluid(FluidField):
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
         self.cell_volume = grid.cell_volume
         self.surroundings = Surroundings(grid, fluid.sides)
-        for name, obstacle in scene.obstacles.items():
-            self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)
+        self._cutter = self._make_cutter() if scene.coupling.transfer == "cutcell" else None
+        if self._cutter is None:
+            for name, obstacle in scene.obstacles.items():
+                self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)
 
         self._axes = range(grid.dim)
         self.velocity = [grid.zeros_faces(axis) for axis in self._axes]
@@ -73,7 +82,13 @@ class MacFluid(FluidField):
         self.smoke = None if fluid.smoke is None else grid.zeros_cells()
         self.cell_kind = np.full(grid.shape(None), FAR, dtype=np.uint8)
         self.face_kind = [grid.zeros_faces(axis, np.uint8) for axis in self._axes]
-        self.geometry_version = 0
+        self.openness = [np.ones(grid.shape(axis)) for axis in self._axes]
+        self.index = grid.index
+        self.extras: Extras | None = None
+        self._extra_pressure = np.zeros(0)
+        self._other_pressure: np.ndarray | None = None
+        self.volume: np.ndarray | None = None
+        self.geometry_version = self.kinds_version = 0
         self._bands = [Band(grid, axis) for axis in self._axes]
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
@@ -84,8 +99,23 @@ class MacFluid(FluidField):
         self.rhs = np.zeros(self.layout.n_local)
         self._pattern = pressure.Pattern(grid)
         self._assembled_for: tuple[int, float] | None = None
-        self.immerse(None, None)
+        self._new_pattern = True
+        if self._cutter is None:
+            self.immerse(None, None)
+        else:
+            self.cut(np.zeros((0, self.dim)), np.zeros((0, self.dim), dtype=np.int64))
         self._start()
+
+    def _make_cutter(self) -> CutGrid | None:
+        """Return what cuts the grid, if the scene has anything to cut it with. Collective."""
+        scene = self.scene
+        if not scene.solids and not scene.obstacles:
+            return None
+        from petfsi.fields.mac.cutgrid import CutGrid
+        from petfsi.geometry.obstacles import obstacle_surfaces
+
+        surfaces = on_root(self.comm, lambda: obstacle_surfaces(scene))
+        return CutGrid(self.grid, self.surroundings, surfaces.points, surfaces.facets, surfaces.base)
 
     def _start(self) -> None:
         """Set velocity and smoke as the scene says for time zero. Collective."""
@@ -140,11 +170,49 @@ class MacFluid(FluidField):
             face_kind.append(kind)
         if self.comm.allreduce(changed, op=MPI.LOR):
             self.cell_kind, self.face_kind = cell_kind, face_kind
-            self._geometry_changed()
+            self.geometry_version += 1
+            self._kinds_changed()
 
-    def _geometry_changed(self) -> None:
-        """Refresh what follows from the kinds. Collective."""
+    def cut(self, points: np.ndarray, facets: np.ndarray) -> Walls:
+        """Take over which parts of cells and faces a surface covers; return what it lets through. Collective.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n, dim)
+            The same on all ranks.
+        facets : ndarray of int, shape (m, dim)
+            Segments or triangles with normals into the fluid.
+        """
+        assert self._cutter is not None
+        found = self._cutter.cut(points, facets)
+        changed = any(
+            not np.array_equal(new, old)
+            for new, old in zip([found.cell_kind, *found.face_kind], [self.cell_kind, *self.face_kind], strict=True)
+        )
+        if found.extras is not None or self.extras is not None:
+            changed = changed or found.extras is None or not found.extras.same(self.extras)
+        if self.comm.allreduce(changed, op=MPI.LOR):
+            self._renumber(found)
+            self.cell_kind, self.face_kind = found.cell_kind, found.face_kind
+            self._kinds_changed()
+        self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.geometry_version += 1
+        return found.walls
+
+    def _renumber(self, found: Openings) -> None:
+        """Take over the unknowns of split cells; the others keep their place. Collective."""
+        self._new_pattern |= found.extras is not None or self.extras is not None
+        self.extras, self.index = found.extras, found.index
+        known = self.pressure if self._other_pressure is None else self._other_pressure
+        self._extra_pressure = np.zeros(0) if found.extras is None else known.reshape(-1)[found.extras.cell]
+        if found.layout != self.layout:
+            self.layout = found.layout
+            self.block = new_block(self.comm, self.layout, self.layout)
+            self.rhs = np.zeros(self.layout.n_local)
+
+    def _kinds_changed(self) -> None:
+        """Refresh what follows from the kinds. Collective."""
+        self.kinds_version += 1
         kind_x, kind_y, kind_z = three(self.face_kind)
         self._active = pressure.active_cells(self.cell_kind, kind_x, kind_y, kind_z, self.dim == 2)
         for axis in self._axes:
@@ -163,29 +231,40 @@ class MacFluid(FluidField):
         Parameters
         ----------
         touched : ndarray of bool or None
-            Cell array: cells that a coupling acts on.
+            This rank's unknowns that a coupling acts on.
 
         Returns
         -------
         list of (ndarray, bool)
-            Per region 1 on its cells and 0 elsewhere (this rank's part, in PETSc's order), and whether any of its
-            cells is touched.
+            Per region 1 on its unknowns and 0 elsewhere (this rank's part), and whether any of them is touched.
         """
-        if self._regions is None or self._regions[0] != self.geometry_version:
+        if self._regions is None or self._regions[0] != self.kinds_version:
             linked = np.zeros_like(self._active)
             for axis in self._axes:
-                acts = np.isin(self.face_kind[axis], (kinds.PRESSURE, kinds.OPEN))
+                acts = np.isin(self.face_kind[axis], (kinds.PRESSURE, kinds.OPEN, kinds.SPLIT))
                 linked |= np.delete(acts, 0, axis) | np.delete(acts, -1, axis)
-            found = find_regions(self.grid, self._active & linked, self.face_kind)
-            self._regions = (self.geometry_version, found)
+            found = find_regions(self.grid, self._active & linked, self.face_kind, self.layout, self.index, self.extras)
+            self._regions = (self.kinds_version, found)
         regions = self._regions[1]
         return list(zip(regions.members, regions.touching(touched), strict=True))
+
+    def volumes(self) -> np.ndarray:
+        """Return the volume of fluid that belongs to each of this rank's unknowns, m^3 (m^2 in 2D)."""
+        if self.volume is None:
+            volume = self.grid.to_vec(self._active).astype(float)
+        else:
+            volume = self.grid.to_vec(self.volume)
+        if self.extras is not None:
+            whole = self.volume.copy()
+            np.subtract.at(whole.reshape(-1), self.extras.cell, self.extras.volume)
+            volume = np.concatenate((self.grid.to_vec(whole), self.extras.volume))
+        return self.cell_volume * volume
 
     # ---- the step ---------------------------------------------------------------------------------------------
 
     def unknown(self) -> np.ndarray:
-        """Return the pressure of this rank's cells, Pa, in PETSc's order."""
-        return self.grid.to_vec(self.pressure)
+        """Return the pressure of this rank's cells and of its extra unknowns, Pa, in PETSc's order."""
+        return np.concatenate((self.grid.to_vec(self.pressure), self._extra_pressure))
 
     def predict(self, time: float, dt: float) -> None:
         """Advect velocity and smoke, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
@@ -261,26 +340,38 @@ class MacFluid(FluidField):
         self.row_scale, self.col_scale = 1.0 / dx ** (self.dim - 1), self.density * dx / dt
         part = self._part(None)
         if self._assembled_for != (self.geometry_version, dt):
-            c = dt / self.density * grid.cell_volume / grid.dx**2
-            values = np.zeros(len(self._pattern.indices))
-            kind_x, kind_y, kind_z = three(self.face_kind)
-            pressure.laplacian(self._active, kind_x, kind_y, kind_z, part, self._pattern.slot, c, values)
-            first = self._assembled_for is None
-            set_csr(self.block, self._pattern.indptr, self._pattern.indices, values, new_pattern=first)
-            self._assembled_for = (self.geometry_version, dt)
-            self.n_assembled += 1
+            self._assemble_block(dt)
         self.rhs[:] = 0.0
+        areas = np.array([grid.face_area(axis) for axis in self._axes])
         for axis in self._axes:
             pressure.known_inflow(
                 self._active,
                 self.velocity_star[axis],
                 self.boundary_velocity[axis],
                 self.face_kind[axis],
+                self.openness[axis],
                 kinds.STEP[axis],
-                grid.face_area(axis),
+                areas[axis],
                 part,
                 self.rhs,
             )
+        if self.extras is not None:
+            self.extras.add_inflow(self.velocity_star, areas, self.layout, self.rhs)
+
+    def _assemble_block(self, dt: float) -> None:
+        """Fill L. Collective."""
+        grid, pattern = self.grid, self._pattern
+        c = dt / self.density * grid.cell_volume / grid.dx**2
+        values = np.zeros(len(pattern.indices))
+        arrays = (*three(self.face_kind), *three(self.openness))
+        pressure.laplacian(self._active, *arrays, self._part(None), pattern.slot, c, values)
+        rows = pattern.indptr, pattern.indices, values
+        if self.extras is not None:
+            rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
+        set_csr(self.block, *rows, new_pattern=self._new_pattern)
+        self._new_pattern = False
+        self._assembled_for = (self.geometry_version, dt)
+        self.n_assembled += 1
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the pressure at ``time + dt`` and set the velocity that goes with it. Collective.
@@ -288,7 +379,8 @@ class MacFluid(FluidField):
         Smoke has moved in ``predict`` already; here cells that are fluid only now get the mean of their neighbours.
         """
         grid = self.grid
-        grid.from_vec(x, self.pressure)
+        n_cells = grid.layout.n_local
+        grid.from_vec(x[:n_cells], self.pressure)
         grid.exchange_cells(self.pressure)
         for axis in self._axes:
             pressure.project(
@@ -301,7 +393,22 @@ class MacFluid(FluidField):
                 self._part(axis),
                 self.velocity[axis],
             )
+        if self.extras is not None:
+            self._extra_pressure = x[n_cells:].copy()
+            self.extras.project(
+                self.velocity_star, self._extra_pressure, self.layout.start + n_cells, self.pressure, self.index,
+                dt / (self.density * grid.dx), self.velocity, self.comm,
+            )  # fmt: skip
+        if self.extras is not None or self._other_pressure is not None:
+            self._remember_extras()
         self._complete()
+
+    def _remember_extras(self) -> None:
+        """Keep the pressure of the second piece of split cells where the next step's cells can find it."""
+        self._other_pressure = self.pressure.copy()
+        if self.extras is not None:
+            second = self.extras.piece == 1
+            self._other_pressure.reshape(-1)[self.extras.cell[second]] = self._extra_pressure[second]
 
     def _complete(self) -> None:
         """Fill ghosts, bands and what lies beyond the sides. Collective."""
@@ -324,14 +431,6 @@ class MacFluid(FluidField):
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
         most = max(advect.largest(v) * dt / h for v, h in zip(self.velocity, self.grid.dx, strict=True))
         return self.comm.allreduce(most, op=MPI.MAX)
-
-    def max_divergence(self) -> float:
-        """Return the largest net outflow of a solved cell over the area of a (cubic) cell's face, m/s. Collective."""
-        areas = np.array([self.grid.face_area(axis) for axis in self._axes])
-        u, v, w = three(self.velocity)
-        most = pressure.largest_outflow(self._active, u, v, w, areas, self._part(None))
-        scale = self.grid.cell_volume ** ((self.dim - 1) / self.dim)
-        return self.comm.allreduce(most, op=MPI.MAX) / scale
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy of the fluid cells, J (in 2D per metre of thickness). Collective."""
@@ -367,7 +466,8 @@ class MacFluid(FluidField):
         for name, array, axis in self._stored():
             self.grid.read_slab(read, name, array, axis)
             self.grid.halo.exchange(array, axis)
-        self._geometry_changed()
+        self.geometry_version += 1
+        self._kinds_changed()
         self._complete()
 
     def _stored(self) -> list[tuple[str, np.ndarray, int | None]]:
@@ -381,6 +481,10 @@ class MacFluid(FluidField):
             stored.append((f"face_kind_{letter}", self.face_kind[axis], axis))
         if self.smoke is not None:
             stored.append(("smoke", self.smoke, None))
+        if self._cutter is not None and self.scene.solids:
+            if self._other_pressure is None:
+                self._other_pressure = self.pressure.copy()
+            stored.append(("pressure_other", self._other_pressure, None))
         return stored
 
     # ---- for the kernels --------------------------------------------------------------------------------------
