@@ -73,7 +73,7 @@ def make_scene(cells, size, solids=None, **extra):
 
 
 def couple(comm, cells, size, points, facets, quadrature=2, sides=None, **shell):
-    scene = make_scene(cells, size, sides=sides or {}, coupling={"quadrature": quadrature})
+    scene = make_scene(cells, size, sides=sides or {}, coupling={"transfer": "ray", "quadrature": quadrature})
     fluid, solid = MacFluid(comm, scene), Shell(comm, points, facets, **shell)
     coupling = RayCoupling(fluid, solid, scene.coupling)
     step(coupling)
@@ -532,7 +532,7 @@ def test_a_block_of_elements_under_water(dim):
     solid = {"shape": {"box": box}, "density": 1200.0, "young": 1e5, "poisson": 0.3}
     solid["supports"] = [{"where": "bottom", "fix": ["x", "y"]}]
     solid["initial"] = {"velocity": ["0.1*y", "0.2"] + ["0.0"] * (dim - 2)}
-    scene = make_scene([20] * dim, [1.0] * dim, solids={"block": solid})
+    scene = make_scene([20] * dim, [1.0] * dim, solids={"block": solid}, coupling={"transfer": "ray"})
     fluid, field = MacFluid(MPI.COMM_WORLD, scene), SimplexSolid(MPI.COMM_WORLD, scene)
     coupling = RayCoupling(fluid, field, scene.coupling)
     step(coupling)
