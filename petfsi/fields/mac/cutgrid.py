@@ -127,9 +127,12 @@ class CutGrid:
         cell_kind, face_kind = self._kinds(openness, split)
         layout, index, extras, slots = self._number(found, links)
         numbers = slots[walls.slot]
-        active = cell_kind.reshape(-1)[self._flat] == kinds.FLUID
-        solved = np.concatenate((active, np.ones(len(found.extra_cell), dtype=bool)))[walls.slot]
-        used = np.flatnonzero(solved & (numbers >= layout.start) & (numbers < layout.end))
+        # a ghost may stand for a cell of this rank itself, which has its own entries
+        own = np.zeros(grid.shape(None), dtype=bool)
+        own[grid.owned(None)] = True
+        own = own.reshape(-1)[self._flat]
+        solved = own & (cell_kind.reshape(-1)[self._flat] == kinds.FLUID)
+        used = np.flatnonzero(np.concatenate((solved, own[found.extra_cell]))[walls.slot])
         walls = Walls(walls.facet[used], walls.axis[used], numbers[used], walls.flux[used])
         return Openings(cell_kind, face_kind, openness, volume, layout, index, extras, walls)
 
