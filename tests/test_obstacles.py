@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from petfsi.errors import InputError
 from petfsi.geometry import obstacles
 from petfsi.geometry.bodies import enclosed
+from petfsi.geometry.clipping import Lattice, cut
 from petfsi.geometry.obstacles import obstacle_surface, obstacle_surfaces
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import occurrences, ridges, shells
@@ -231,3 +232,41 @@ def test_shapes_that_need_too_many_facets_and_unfit_files_are_named(tmp_path, mo
     for shape in ({"ball": {"centre": [0.0] * 3, "radius": 1.0}}, SHAPES["cylinder"][0]):
         with pytest.raises(InputError, match=r"o\.shape\.(ball|cylinder)\.radius = .* at most 1e\+03 may be"):
             surface(shape)
+
+
+# ---- cut by the grid ----------------------------------------------------------------------------------------
+
+LEANING = {"shape": {"halfspace": {"point": [0.5, 0.1, 0.5], "normal": [0.0, 2.0, 1.0]}}}
+PIPE = {"shape": {"box": {"origin": [-1.0, 0.25, 0.1], "size": [3.0, 0.5, 0.8]}}, "outside": True}
+TUBE = {"shape": {"cylinder": {"start": [-1.0, 0.5, 0.5], "end": [2.0, 0.5, 0.5], "radius": 0.4}}, "outside": True}
+CAVE = {"shape": {"ball": {"centre": [0.5, 0.5, 0.5], "radius": 0.45}}, "outside": True}
+PEBBLE = {"shape": {"ball": {"centre": [0.45, 0.5, 0.5], "radius": 0.2}}}
+BALL_VOLUME = 4 / 3 * math.pi
+
+
+@pytest.mark.parametrize(
+    "obstacles, room, sides",
+    [
+        ({"floor": LEANING}, 1 - 0.5 * 0.35 * 0.7, {}),
+        ({"floor": LEANING}, 1 - 0.5 * 0.35 * 0.7, {"left": "periodic", "right": "periodic"}),
+        ({"pipe": PIPE}, 0.4, {}),
+        ({"pipe": PIPE}, 0.4, {"left": "periodic", "right": "periodic"}),
+        ({"tube": TUBE}, math.pi * 0.16, {}),
+        ({"cave": CAVE, "pebble": PEBBLE}, BALL_VOLUME * (0.45**3 - 0.2**3), {}),
+    ],
+)
+def test_the_grid_finds_the_room_that_obstacles_leave(obstacles, room, sides):
+    fluid = {"density": 1.0, "origin": [0.0] * 3, "size": [1.0] * 3, "cells": [10, 12, 14], "sides": sides}
+    data = {"dim": 3, "time": {"end": 1.0, "dt": 0.1}, "fluid": fluid, "obstacles": obstacles}
+    every = obstacle_surfaces(scene_from_dict(data))
+    cells = np.array([10, 12, 14])
+    periodic = np.array(["left" in sides, False, False])
+    lattice = Lattice(np.zeros(3), 1 / cells, cells, periodic, np.zeros(3, dtype=int), cells)
+    got = cut(every.points, every.facets, lattice, every.base)
+    assert got.volume.mean() == pytest.approx(room, rel=2e-8)
+    # every cell is closed: its open faces and its walls
+    wall = np.zeros((cells.prod(), 3))
+    np.add.at(wall, got.cell, got.integrals.sum(axis=1)[:, None] * got.normals[got.facet])
+    for axis in range(3):
+        flux = np.diff(got.open[axis], axis=axis) / (cells.prod() / cells[axis])
+        assert np.abs(flux.ravel() - wall[:, axis]).max() < 1e-13
