@@ -58,7 +58,7 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Real, Field(gt=0, description="s")]
-    integrator: Literal["newmark"] = "newmark"
+    integrator: Literal["newmark", "bdf2", "midpoint"] = "newmark"
 
     @property
     def steps(self) -> int:
