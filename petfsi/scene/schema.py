@@ -194,6 +194,7 @@ class Fluid(Table):
     size: Annotated[Vector, Field(description="m")]
     cells: Cells
     sides: Sides = Sides()
+    advection: Literal["cubic", "linear"] = "cubic"
     smoke: Smoke | None = None
     initial: FluidInitial = FluidInitial()
 
