@@ -1,4 +1,4 @@
-"""Time integrators of solids: what turns M, C, K, K' and history into A and b."""
+"""Time integrators: what turns M, C, K, K' and history into one linear system a step, for solids and fluids alike."""
 
 from __future__ import annotations
 
@@ -9,37 +9,85 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Coefficients:
-    """The factors of one step, per body or scalar:  A = A_M M + A_K K',  b = b_M M u - b_K K' u - K(d) + f_e.
+class Motion:
+    """Where a solid's nodes are, how fast they move, and what a scheme remembers of earlier steps.
 
     Attributes
     ----------
-    A_M, b_M : ndarray or float
-        1/s.
-    A_K, b_K : ndarray or float
-        s.
+    displacement, velocity : ndarray, shape (n, dim)
+        m, m/s.
+    past : tuple of ndarray, shape (n, dim)
+        By the scheme's ``past``; not read while ``past_dt`` is zero.
+    past_dt : float
+        Length of the last step, s; zero before the first.
     """
 
-    A_M: np.ndarray | float
-    A_K: np.ndarray | float
-    b_M: np.ndarray | float
-    b_K: np.ndarray | float
+    displacement: np.ndarray
+    velocity: np.ndarray
+    past: tuple[np.ndarray, ...] = ()
+    past_dt: float = 0.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The equation of one step for w, a velocity at the instant where the forces are taken.
+
+        M (a w - V0) + C w + K(d~) + K'(d~) (D0 + k w - d~) = f
+
+    Attributes
+    ----------
+    a, k : float
+        1/s, s.
+    inertia : ndarray, shape (n, dim)
+        V0, m/s^2.
+    tangent_at : ndarray, shape (n, dim)
+        d~, the displacement at which forces are linearised and fluid and solid meet, m.
+    shift : ndarray, shape (n, dim)
+        D0 - d~, m.
+    """
+
+    a: float
+    k: float
+    inertia: np.ndarray
+    tangent_at: np.ndarray
+    shift: np.ndarray
 
 
 class Integrator(Protocol):
-    """What a scheme offers."""
+    """What a scheme offers; ``h`` is the length of the coming step, ``past_dt`` that of the last one (0: none)."""
 
     @property
     def order(self) -> int:
         """The order of accuracy in the time step that it keeps."""
         ...
 
-    def coefficients(self, dt: float, mass_damping: np.ndarray, stiffness_damping: np.ndarray) -> Coefficients:
-        """Return the factors of a step of length ``dt`` with damping C = mass_damping M + stiffness_damping K'."""
+    @property
+    def past(self) -> tuple[str, ...]:
+        """The names of the arrays in ``Motion.past``."""
         ...
 
-    def displacement(self, d: np.ndarray, u0: np.ndarray, u1: np.ndarray, dt: float) -> np.ndarray:
-        """Return the new displacement from the old one and the old and new velocity."""
+    def factor(self, h: float, past_dt: float) -> float:
+        """Return 1/a, s: an acceleration acts so long on w, and the pressure's gradient on the fluid's velocity."""
+        ...
+
+    def moment(self, h: float) -> float:
+        """Return how long after the step's begin its equations hold, s."""
+        ...
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return the times after the step's begin (s) over which w of a prescribed velocity is the mean."""
+        ...
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return w of the last step; before the first the velocity."""
+        ...
+
+    def stage(self, motion: Motion, h: float) -> Stage:
+        """Return the equation of the coming step."""
+        ...
+
+    def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
+        """Return the motion at the end of the step from the solution of its equation."""
         ...
 
 
@@ -59,15 +107,168 @@ class Newmark:
     """
 
     order: ClassVar[int] = 1
+    past: ClassVar[tuple[str, ...]] = ()
 
-    def coefficients(self, dt: float, mass_damping: np.ndarray, stiffness_damping: np.ndarray) -> Coefficients:
-        """Return the factors of eq. 18."""
-        return Coefficients(A_M=1 / dt + mass_damping, A_K=dt / 2 + stiffness_damping, b_M=1 / dt, b_K=dt / 2)
+    def factor(self, h: float, past_dt: float) -> float:
+        """Return h."""
+        return h
 
-    def displacement(self, d: np.ndarray, u0: np.ndarray, u1: np.ndarray, dt: float) -> np.ndarray:
-        """Return d^{n+1} of eq. 12."""
-        return d + dt / 2 * (u0 + u1)
+    def moment(self, h: float) -> float:
+        """Return h: the end of the step."""
+        return h
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return the end of the step."""
+        return (h,)
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return u^n."""
+        return motion.velocity
+
+    def stage(self, motion: Motion, h: float) -> Stage:
+        """Return eq. 18."""
+        d, u = motion.displacement, motion.velocity
+        return Stage(a=1 / h, k=h / 2, inertia=u / h, tangent_at=d, shift=h / 2 * u)
+
+    def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
+        """Return u^{n+1} = w and d^{n+1} of eq. 12."""
+        return Motion(motion.displacement + h / 2 * (motion.velocity + w), w, (), h)
+
+
+@dataclass(frozen=True)
+class Bdf2:
+    """The second backward differentiation formula for steps of any length, linearised once a step.
+
+    With r = h_n / h_{n-1} and c = h (1 + r)/(1 + 2 r), the derivative of a quantity q at the end of the step is
+
+        (q^{n+1} - b q^n + b' q^{n-1}) / c,     b = (1 + r)^2 / (1 + 2 r),  b' = r^2 / (1 + 2 r),
+
+    for equal steps (3 q^{n+1} - 4 q^n + q^{n-1}) / 2h. Forces are linearised at d~ = d^n + r (d^n - d^{n-1}), which
+    is within h^2 of the end, and so is what the linearisation leaves out within h^4. The first step is backward
+    Euler's, about d~ = d^n + h u^n. Damps what is too fast for the step (L-stable).
+
+    References
+    ----------
+    E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (1993), section III.5.
+    """
+
+    order: ClassVar[int] = 2
+    past: ClassVar[tuple[str, ...]] = ("displacement_before", "velocity_before")
+
+    def factor(self, h: float, past_dt: float) -> float:
+        """Return c; 2h/3 for equal steps, h in the first one."""
+        return h if past_dt == 0.0 else h * (past_dt + h) / (past_dt + 2 * h)
+
+    def weights(self, h: float, past_dt: float) -> tuple[float, float]:
+        """Return b and b'; 4/3 and 1/3 for equal steps, 1 and 0 in the first one."""
+        if past_dt == 0.0:
+            return 1.0, 0.0
+        r = h / past_dt
+        return (1 + r) ** 2 / (1 + 2 * r), r**2 / (1 + 2 * r)
+
+    def moment(self, h: float) -> float:
+        """Return h: the end of the step."""
+        return h
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return the end of the step."""
+        return (h,)
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return u^n."""
+        return motion.velocity
+
+    def stage(self, motion: Motion, h: float) -> Stage:
+        """Return the equation at the end of the step."""
+        d, u = motion.displacement, motion.velocity
+        c = self.factor(h, motion.past_dt)
+        if motion.past_dt == 0.0:
+            return Stage(a=1 / c, k=c, inertia=u / c, tangent_at=d + h * u, shift=-h * u)
+        (before_d, before_u), (b, b_past) = motion.past, self.weights(h, motion.past_dt)
+        ahead = d + h / motion.past_dt * (d - before_d)
+        return Stage(
+            a=1 / c,
+            k=c,
+            inertia=(b * u - b_past * before_u) / c,
+            tangent_at=ahead,
+            shift=b * d - b_past * before_d - ahead,
+        )
+
+    def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
+        """Return u^{n+1} = w and the d^{n+1} whose derivative it is."""
+        d = stage.tangent_at + stage.shift + stage.k * w
+        return Motion(d, w, (motion.displacement, motion.velocity), h)
+
+
+@dataclass(frozen=True)
+class Midpoint:
+    """The implicit midpoint rule, linearised once a step; w is the velocity half-way.
+
+        M 2 (w - u^n)/h + C w + K(d~) + K'(d~) (d^n + h/2 w - d~) = f(t^n + h/2),
+        u^{n+1} = 2 w - u^n,   d^{n+1} = d^n + h w.
+
+    Without damping it keeps a quadratic energy, and damps nothing else either. d~ = d^n + h/2 w~ takes w~ on the
+    line through the last two w, because u^n swings about it where a mode is too fast for the step.
+
+    References
+    ----------
+    E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), sections II.1 and IV.2.
+    """
+
+    order: ClassVar[int] = 2
+    past: ClassVar[tuple[str, ...]] = ("velocity_middle", "velocity_ahead")
+
+    def factor(self, h: float, past_dt: float) -> float:
+        """Return h/2."""
+        return h / 2
+
+    def moment(self, h: float) -> float:
+        """Return h/2: the middle of the step."""
+        return h / 2
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return both ends: their mean as w brings a prescribed node to its velocity at the end exactly."""
+        return (0.0, h)
+
+    def ahead(self, w: np.ndarray, w_before: np.ndarray, h: float, past_dt: float) -> np.ndarray:
+        """Return the velocity at the step's end, on the line through those at the middles of it and the step before.
+
+        Before the first step the earlier one is that at its begin.
+        """
+        return w + h / (h + past_dt) * (w - w_before)
+
+    def later(self, ahead: np.ndarray, w: np.ndarray, span: float, past_dt: float) -> np.ndarray:
+        """Return the velocity a time ``span`` after the end of the last step, on the line from its middle to its end.
+
+        Parameters
+        ----------
+        ahead, w : ndarray
+            At the last step's end and in its middle.
+        span, past_dt : float
+            s; the second is the last step's length, zero before the first.
+        """
+        return ahead if past_dt == 0.0 or span == 0.0 else ahead + 2 * span / past_dt * (ahead - w)
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return the velocity in the middle of the last step."""
+        return motion.past[0] if motion.past_dt else motion.velocity
+
+    def stage(self, motion: Motion, h: float) -> Stage:
+        """Return the equation in the middle of the step."""
+        d, u = motion.displacement, motion.velocity
+        w, ahead = motion.past if motion.past_dt else (u, u)
+        step = h / 2 * self.later(ahead, w, h / 2, motion.past_dt)
+        return Stage(a=2 / h, k=h / 2, inertia=2 / h * u, tangent_at=d + step, shift=-step)
+
+    def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
+        """Return the end of the step."""
+        ahead = self.ahead(w, self.solved(motion), h, motion.past_dt)
+        return Motion(motion.displacement + h * w, 2 * w - motion.velocity, (w, ahead), h)
 
 
 #: The scene's ``time.integrator`` by name.
-INTEGRATORS: dict[str, type[Integrator]] = {"newmark": Newmark}
+INTEGRATORS: dict[str, type[Newmark] | type[Bdf2] | type[Midpoint]] = {
+    "newmark": Newmark,
+    "bdf2": Bdf2,
+    "midpoint": Midpoint,
+}

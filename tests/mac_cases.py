@@ -11,10 +11,11 @@ PERIODIC = {"left": "periodic", "right": "periodic", "bottom": "periodic", "top"
 BOX = {"shape": {"box": {"origin": [0.35, 0.3], "size": [0.3, 0.3]}}}
 
 
-def make_scene(cells, gravity=None, obstacles=None, **fluid):
+def make_scene(cells, gravity=None, obstacles=None, integrator="newmark", **fluid):
     dim = len(cells)
     fluid = {"origin": [0.0] * dim, "size": [1.0] * dim, "density": 1000.0, "cells": list(cells)} | fluid
-    scene = {"dim": dim, "time": {"end": 1.0, "dt": 0.1}, "fluid": fluid, "obstacles": obstacles or {}}
+    time = {"end": 1.0, "dt": 0.1, "integrator": integrator}
+    scene = {"dim": dim, "time": time, "fluid": fluid, "obstacles": obstacles or {}}
     if gravity is not None:
         scene["gravity"] = gravity
     return Scene.model_validate(scene)

@@ -5,12 +5,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.fields.solid import SimplexSolid
-from petfsi.fields.solid.elements import Bodies, Elements
+from petfsi.fields.solid.elements import Bodies, Elements, State
 from petfsi.fields.solid.materials import MATERIALS, lame_parameters
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.geometry.meshes import box_mesh
-from petfsi.integrators import Coefficients
 from petfsi.petsc import Layout
 from petfsi.scene.schema import Box, Scene
 
@@ -25,8 +24,9 @@ def body(dim, cells=(3, 2, 2), origin=(0.0, 0.0, 0.0), size=(1.5, 1.0, 0.8), cav
     return {"shape": shape, "density": DENSITY, "young": YOUNG, "poisson": POISSON, **more}
 
 
-def field(dim, comm=MPI.COMM_SELF, gravity=None, **solids):
-    scene = {"dim": dim, "gravity": gravity, "time": {"end": 1.0, "dt": 0.1}, "solids": solids}
+def field(dim, comm=MPI.COMM_SELF, gravity=None, integrator="newmark", **solids):
+    time = {"end": 1.0, "dt": 0.1, "integrator": integrator}
+    scene = {"dim": dim, "gravity": gravity, "time": time, "solids": solids}
     return SimplexSolid(comm, Scene.model_validate(scene))
 
 
@@ -129,12 +129,13 @@ def pattern_of(points, cells):
     )  # fmt: skip
 
 
-def respond(elements, pattern, d, u=None, step=None):
+def respond(elements, pattern, d, inertia=None, shift=None, a=0.0, k=1.0):
     """Return the dense matrix and b for given factors; by default K' and -K(d)."""
     n = d.size
     values, b = np.empty(len(pattern.indices)), np.empty_like(d)
-    step = step or Coefficients(0.0, 1.0, 0.0, 0.0)
-    elements.assemble(d, np.zeros_like(d) if u is None else u, step, pattern, values, b)
+    zero = np.zeros_like(d)
+    state = State(d, zero if inertia is None else inertia, zero if shift is None else shift)
+    elements.assemble(state, a, k, pattern, values, b)
     A = np.zeros((n, n))
     A[np.repeat(np.arange(n), np.diff(pattern.indptr)), pattern.indices] = values
     return A, b

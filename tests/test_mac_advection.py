@@ -32,7 +32,7 @@ def test_a_linear_scalar_in_a_rotation_moves_as_the_midpoint_rule_says(dim):
             :dim
         ],
     )
-    dt = 0.15
+    dt = 0.11
     fluid.predict(0.0, dt)
     x, y, *z = centres(fluid)
     # departure points z (1 - i dt - dt^2 / 2): the exact rotation up to dt^3 / 6
@@ -41,7 +41,7 @@ def test_a_linear_scalar_in_a_rotation_moves_as_the_midpoint_rule_says(dim):
     if dim == 3:
         wanted = wanted + z[0] - 0.1 * dt
         inner &= (z[0] > 0.1) & (z[0] < 0.9)
-    assert np.abs(smoke(fluid) - wanted)[inner].max() < 1e-13
+    assert np.abs(smoke(fluid) - wanted)[inner].max() < 1e-12
     exact = (x - 0.5) * np.cos(dt) + (y - 0.5) * np.sin(dt)
     if dim == 2:
         assert np.abs(smoke(fluid) - exact)[inner].max() < dt**3 / 6
@@ -51,7 +51,7 @@ def test_a_linear_scalar_in_a_rotation_moves_as_the_midpoint_rule_says(dim):
 @pytest.mark.parametrize("courant", [0.3, 1.7, 3.9])
 def test_uniform_flow_damps_a_wave_by_the_factor_of_linear_interpolation(courant):
     n = 24
-    fluid = smoke_fluid((n, n), "sin(2*pi*x)*cos(4*pi*y)", sides=PERIODIC)
+    fluid = smoke_fluid((n, n), "sin(2*pi*x)*cos(4*pi*y)", sides=PERIODIC, advection="linear")
     set_velocity(fluid, [lambda x, y, z: 1.0, lambda x, y, z: -0.5])
     dt, steps = courant / n, 5
     for number in range(steps):
@@ -70,10 +70,12 @@ def test_uniform_flow_damps_a_wave_by_the_factor_of_linear_interpolation(courant
     assert np.abs(smoke(fluid) - a.imag * b.real).max() < 1e-13
 
 
-def test_a_blob_in_a_rotation_converges_with_order_one():
+@pytest.mark.parametrize("interpolation, order, last", [("linear", 1.0, 0.03), ("cubic", 1.2, 1.5e-3)])
+def test_a_blob_in_a_rotation_converges(interpolation, order, last):
+    """Cubics are cut at the blob's peak, to stay within the values around, and that costs order there."""
     errors = []
     for n in (32, 64, 128):
-        fluid = smoke_fluid((n, n), "exp(-((x-0.5)**2+(y-0.65)**2)/0.03)")
+        fluid = smoke_fluid((n, n), "exp(-((x-0.5)**2+(y-0.65)**2)/0.03)", advection=interpolation)
         set_velocity(fluid, [lambda x, y, z: 0.5 - y + 0 * x, lambda x, y, z: x - 0.5 + 0 * y])
         steps = n // 8
         for number in range(steps):
@@ -82,9 +84,37 @@ def test_a_blob_in_a_rotation_converges_with_order_one():
         c, s = np.cos(1.0), np.sin(1.0)
         exact = np.exp(-((x - 0.5 + 0.15 * s) ** 2 + (y - 0.5 - 0.15 * c) ** 2) / 0.03)
         errors.append(np.abs(smoke(fluid) - exact)[np.hypot(x - 0.5, y - 0.5) < 0.45].max())
-    order = np.diff(-np.log2(errors))
-    assert order[-1] > 0.9, (errors, order)
-    assert errors[-1] < 0.03
+    seen = np.diff(-np.log2(errors))
+    assert seen[-1] > order - 0.1, (errors, seen)
+    assert errors[-1] < last
+
+
+@pytest.mark.parametrize("shape", [(20, 17, 1), (16, 14, 15)])
+def test_cubic_interpolation_is_exact_for_cubics(shape):
+    """Uniform flow carries a product of cubics by any distance up to three cells, and up to the array's ends."""
+    flat = shape[2] == 1
+    polynomials = [np.polynomial.Polynomial([1.0, 0.13, -0.8, 0.3], domain=[0, n]) for n in shape]
+    if flat:
+        polynomials[2] = np.polynomial.Polynomial([1.0])
+
+    def product(shift):
+        i = np.indices(shape, dtype=float)
+        return np.prod([f(x - s) for f, x, s in zip(polynomials, i, shift, strict=True)], axis=0)
+
+    shift = (2.7, -1.3, 0.0 if flat else 0.45)
+    q = product((0.0, 0.0, 0.0))
+    out = np.full(shape, np.nan)
+    flow = [np.full(tuple(n + (a == b) for b, n in enumerate(shape)), s) for a, s in enumerate(shift)]
+    part = ((3, shape[0]), (0, shape[1] - 2), (0, 1) if flat else (1, shape[2]))
+    moved = np.ones(shape, dtype=bool)
+    low, high = (0.0, 0.0, 0.0), tuple(map(float, shape))
+    advect.sweep(q, out, moved, *flow, (0.5, 0.5, 0.5), part, (1.0, 1.0, 1.0), low, high, 0.5, True, False)
+    own = tuple(slice(*p) for p in part)
+    np.testing.assert_allclose(out[own], product(shift)[own], atol=1e-13)
+    steep = (np.indices(shape).sum(axis=0) > 15).astype(float)
+    for bounded in (False, True):
+        advect.sweep(steep, out, moved, *flow, (0.5, 0.5, 0.5), part, (1.0, 1.0, 1.0), low, high, 0.5, True, bounded)
+        assert (out[own].max() > 1.01) != bounded and (out[own].min() < -0.01) != bounded
 
 
 @pytest.mark.parallel([1, 2, 3, 4])
@@ -151,14 +181,17 @@ def test_smoke_keeps_its_bounds_past_obstacles_jets_and_open_sides():
     assert np.all(values[:8, 10:14] > 0.85)
 
 
-def test_departure_points_never_index_wildly():
+@pytest.mark.parametrize("cubic, bounded", [(False, False), (True, False), (True, True)])
+def test_departure_points_never_index_wildly(cubic, bounded):
     q = np.ones((12, 12, 1))
     nan = np.full((13, 13, 1), np.nan)
     out = np.zeros_like(q)
     moved = np.ones(q.shape, dtype=bool)
     part, low, high = ((0, 12), (0, 12), (0, 1)), (0.0, 0.0, 0.0), (12.0, 12.0, 1.0)
     for bad in (nan, np.full_like(nan, np.inf), np.full_like(nan, -1e300)):
-        advect.sweep(q, out, moved, bad, bad, bad, (0.5, 0.5, 0.5), part, (1.0, 1.0, 0.0), low, high, 0.5)
-        assert np.all(out == 1.0)
+        advect.sweep(
+            q, out, moved, bad, bad, bad, (0.5, 0.5, 0.5), part, (1.0, 1.0, 0.0), low, high, 0.5, cubic, bounded
+        )
+        np.testing.assert_allclose(out, 1.0, rtol=1e-14)
     assert not advect.all_finite(nan) and advect.all_finite(q)
     assert not advect.all_finite(np.array([[[1.0, -np.inf]]]))

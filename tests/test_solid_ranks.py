@@ -8,8 +8,8 @@ from petsc4py import PETSc
 from solid_cases import YOUNG, body, field, gathered, step, wave
 
 from petfsi.errors import InputError
+from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.partition import Fetch, bisect
-from petfsi.integrators import Coefficients
 from petfsi.petsc import Layout
 
 
@@ -30,7 +30,7 @@ def test_the_near_null_space_is_that_of_the_stiffness(dim):
     for mode in modes:
         u = solid._with_shared(mode.reshape(-1, dim))
         values = np.empty(len(solid._pattern.indices))
-        solid._elements.assemble(rest, u, Coefficients(0.0, 0.0, 0.0, 1.0), solid._pattern, values, b)
+        solid._elements.assemble(State(rest, 0 * u, u), 0.0, 1.0, solid._pattern, values, b)
         assert np.abs(b).max(initial=0) < 1e-12 * YOUNG
     solid.assemble(0.0, 0.1)
     assert len(solid.block.getNearNullSpace().getVecs()) == len(modes)

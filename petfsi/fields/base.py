@@ -33,6 +33,12 @@ class Slab:
     shape: tuple[int, ...]
 
 
+def scalar_slab(comm: MPI.Comm, value: float) -> Slab:
+    """Return a number, the same on all ranks, as a global array of one entry that rank 0 owns."""
+    mine = comm.rank == 0
+    return Slab(np.array([value] if mine else []), (0 if mine else 1,), (1,))
+
+
 #: Reads the piece ``[start, start + count)`` of the stored array of that name: ``read(name, start, count)``.
 Reader = Callable[[str, tuple[int, ...], tuple[int, ...]], np.ndarray]
 
@@ -79,7 +85,7 @@ class Field(ABC):
 
     @abstractmethod
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
-        """Take the new unknowns (SI) at ``time + dt`` and move everything that moves with them."""
+        """Take the solution (SI) of the step from ``time`` to ``time + dt`` and move all that moves with it."""
 
     @abstractmethod
     def output(self) -> dict[str, Slab]:
@@ -151,15 +157,21 @@ class SolidField(Field):
 
     @abstractmethod
     def surface_positions(self) -> np.ndarray:
-        """Return the present positions of its points, shape (n_points, dim), on every rank. Collective."""
+        """Return the positions of its points, shape (n_points, dim), on every rank. Collective.
+
+        Between ``predict`` and ``accept`` those at which the step's equations are taken, otherwise the present ones.
+        """
 
     @abstractmethod
     def surface_velocity(self) -> np.ndarray:
-        """Return the present velocities of its points, shape (n_points, dim), on every rank. Collective."""
+        """Return the solution of the step last accepted at its points, shape (n_points, dim), on every rank.
+
+        It is the velocity where the integrator takes the forces: at the end of the step, or in its middle. Collective.
+        """
 
     @abstractmethod
     def fixed_velocity(self) -> np.ndarray:
-        """Return prescribed velocities at the end of the step by unknown, zero where free, on every rank."""
+        """Return what the step prescribes of its solution by unknown, zero where free, on every rank."""
 
     @abstractmethod
     def probe(self, body: str, at: list[float], quantity: str) -> np.ndarray:

@@ -58,7 +58,7 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Real, Field(gt=0, description="s")]
-    integrator: Literal["newmark"] = "newmark"
+    integrator: Literal["newmark", "bdf2", "midpoint"] = "newmark"
 
     @property
     def steps(self) -> int:
@@ -195,6 +195,7 @@ class Fluid(Table):
     size: Annotated[Vector, Field(description="m")]
     cells: Cells
     sides: Sides = Sides()
+    advection: Literal["cubic", "linear"] = "cubic"
     smoke: Smoke | None = None
     initial: FluidInitial = FluidInitial()
 

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import FluidField, Reader, Slab
+from petfsi.errors import InputError
+from petfsi.fields.base import FluidField, Reader, Slab, scalar_slab
 from petfsi.fields.mac import advect, kinds, pressure, views
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, evaluate_at, periodic_axes, wrapped_points
+from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.petsc import new_block, set_csr
 from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
@@ -24,18 +25,14 @@ if TYPE_CHECKING:
     from petfsi.fields.mac.cut import Walls
     from petfsi.fields.mac.cutgrid import CutGrid, Openings
 
-#: Cells that the flow may cross in one sweep of the advection; the ghosts are this wide, and one more.
-MAX_COURANT = 4.0
-#: Times that it may cross the whole grid in one step; more is no flow any longer.
-MAX_CROSSINGS = 10
-
 
 class MacFluid(FluidField):
     """A field whose unknown is the pressure of every cell of the grid.
 
-    A step: ``predict`` advects velocity (and smoke) along the flow at the old time and adds forces, which gives
-    ``velocity_star``; the solve finds p such that v = v* - (dt/rho) G p has no divergence; ``accept`` sets v and
-    extrapolates it into faces where the flow is not determined.
+    A step: ``predict`` carries velocity (and smoke) along the flow and adds forces, which gives ``velocity_star``; the
+    solve finds p such that v_w = v* - (c/rho) G p has no divergence, with c of the integrator (see ``transport``);
+    ``accept`` makes of v_w the velocity at the step's end and extrapolates it into faces where the flow is not
+    determined.
 
     Attributes
     ----------
@@ -69,6 +66,8 @@ class MacFluid(FluidField):
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
         self.cell_volume = grid.cell_volume
         self.surroundings = Surroundings(grid, fluid.sides)
+        advection = Advection(grid, self.surroundings, fluid.advection)
+        self._transport = TRANSPORTS[scene.time.integrator](advection)
         self._cutter = self._make_cutter() if scene.coupling.transfer == "cutcell" else None
         if self._cutter is None:
             for name, obstacle in scene.obstacles.items():
@@ -267,80 +266,48 @@ class MacFluid(FluidField):
         return np.concatenate((self.grid.to_vec(self.pressure), self._extra_pressure))
 
     def predict(self, time: float, dt: float) -> None:
-        """Advect velocity and smoke, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
-        courant = self.cfl(dt)
-        if not courant <= MAX_CROSSINGS * max(self.grid.cells):
-            raise SolveError(
-                f"the flow has blown up: it would cross {courant:.1e} cells, more than the whole grid "
-                f"{MAX_CROSSINGS} times, in one step of {dt:g} s. Take a smaller dt, or look at what drives it."
-            )
-        n = max(1, int(np.ceil(courant / MAX_COURANT)))
-        for axis in self._axes:
-            self._advect(self.velocity[axis], self.velocity_star[axis], self._moved[axis], axis, dt, n)
+        """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
+        transport = self._transport
+        transport.predict(self.velocity, self._moved, dt, self.velocity_star)
+        moment, smoke = transport.moment(dt), self.smoke
         if self.smoke is not None and self._smoke_band is not None:
-            smoke = np.empty_like(self.smoke)
-            self._advect(self.smoke, smoke, self._smoke_band.layer != FAR, None, dt, n)
-            self.smoke = smoke
-            self._complete_cells(smoke)
-        self.surroundings.evaluate(time + dt)
+            old = self.smoke
+            self.smoke = transport.carry_smoke(old, self.velocity, self._smoke_band.layer != FAR, dt)
+            self._complete_cells(self.smoke)
+            smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
+        self.surroundings.evaluate(time + moment)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
-        self._add_forces(time + dt, dt)
+        self._add_forces(time + moment, transport.factor(dt), smoke)
 
-    def _advect(self, q: np.ndarray, out: np.ndarray, moved: np.ndarray, axis: int | None, dt: float, n: int) -> None:
-        """Advect q by dt into the owned part of ``out``, in n sweeps along the velocity at the old time."""
-        grid = self.grid
-        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
-        courant = (*(dt / n / grid.dx), 0.0)[:3]
-        # a departure point in a ghost cell of another rank or a periodic axis is as good as any
-        low = tuple(
-            0.0 if p else float(max(0, g - m)) for p, g, m in zip(grid.periodic, grid.ghost, grid.lo, strict=True)
-        )
-        high = tuple(
-            float(s) if p else float(min(s, g - m + c))
-            for p, s, g, m, c in zip(grid.periodic, grid.shape(None), grid.ghost, grid.lo, grid.cells, strict=True)
-        )
-        # smoke comes in from behind the sides, where the ghosts know what a jet carries
-        reach = 0.5 if axis is None else 0.0
-        u, v, w = three(self.velocity)
-        for number in range(n):
-            target = out if number == n - 1 else np.empty_like(q)
-            advect.sweep(q, target, moved, u, v, w, offset, self._part(axis), courant, low, high, reach)
-            if number < n - 1:
-                grid.halo.exchange(target, axis)
-                if axis is None:
-                    self.surroundings.fill_smoke(target)
-                else:
-                    grid.fill_sides(target, axis)
-                q = target
-
-    def _add_forces(self, time: float, dt: float) -> None:
-        """Accelerate ``velocity_star`` and set it on WALL faces. Collective."""
-        smoke, buoyancy = self.pressure, 0.0
-        if self.smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
-            smoke, buoyancy = self.smoke, self.scene.fluid.smoke.buoyancy
+    def _add_forces(self, time: float, duration: float, smoke: np.ndarray | None) -> None:
+        """Accelerate ``velocity_star`` as at ``time`` for ``duration`` and set it on WALL faces. Collective."""
+        buoyancy = 0.0
+        if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
+            buoyancy = self.scene.fluid.smoke.buoyancy
         for axis in self._axes:
             star, kind = self.velocity_star[axis], self.face_kind[axis]
-            dv = dt * float(self._gravity[axis](t=time))
+            dv = duration * float(self._gravity[axis](t=time))
             pressure.add_forces(
                 star,
                 self.boundary_velocity[axis],
                 kind,
                 kinds.STEP[axis],
                 dv,
-                smoke,
+                self.pressure if smoke is None else smoke,
                 -buoyancy * dv,
                 self._part(axis),
             )
             self.grid.exchange_faces(axis, star, width=1)
 
     def assemble(self, time: float, dt: float) -> None:
-        """Refresh L if the geometry or dt changed, the right-hand side and the scales. Collective."""
+        """Refresh L if the geometry or the step changed, the right-hand side and the scales. Collective."""
         grid = self.grid
         dx = grid.cell_volume ** (1.0 / self.dim)
         self.row_scale, self.col_scale = 1.0 / dx ** (self.dim - 1), self.density * dx / dt
         part = self._part(None)
-        if self._assembled_for != (self.geometry_version, dt):
-            self._assemble_block(dt)
+        factor = self._transport.factor(dt)
+        if self._assembled_for != (self.geometry_version, factor):
+            self._assemble_block(factor)
         self.rhs[:] = 0.0
         areas = np.array([grid.face_area(axis) for axis in self._axes])
         for axis in self._axes:
@@ -358,10 +325,10 @@ class MacFluid(FluidField):
         if self.extras is not None:
             self.extras.add_inflow(self.velocity_star, areas, self.layout, self.rhs)
 
-    def _assemble_block(self, dt: float) -> None:
-        """Fill L. Collective."""
+    def _assemble_block(self, factor: float) -> None:
+        """Fill L for the step's factor (see ``transport``). Collective."""
         grid, pattern = self.grid, self._pattern
-        c = dt / self.density * grid.cell_volume / grid.dx**2
+        c = factor / self.density * grid.cell_volume / grid.dx**2
         values = np.zeros(len(pattern.indices))
         arrays = (*three(self.face_kind), *three(self.openness))
         pressure.laplacian(self._active, *arrays, self._part(None), pattern.slot, c, values)
@@ -370,18 +337,19 @@ class MacFluid(FluidField):
             rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
         set_csr(self.block, *rows, new_pattern=self._new_pattern)
         self._new_pattern = False
-        self._assembled_for = (self.geometry_version, dt)
+        self._assembled_for = (self.geometry_version, factor)
         self.n_assembled += 1
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
-        """Take the pressure at ``time + dt`` and set the velocity that goes with it. Collective.
+        """Take the pressure and set the velocity that goes with it. Collective.
 
         Smoke has moved in ``predict`` already; here cells that are fluid only now get the mean of their neighbours.
         """
-        grid = self.grid
+        grid, factor = self.grid, self._transport.factor(dt)
         n_cells = grid.layout.n_local
         grid.from_vec(x[:n_cells], self.pressure)
         grid.exchange_cells(self.pressure)
+        solved = [np.zeros_like(v) for v in self.velocity]
         for axis in self._axes:
             pressure.project(
                 self.velocity_star[axis],
@@ -389,19 +357,22 @@ class MacFluid(FluidField):
                 self.boundary_velocity[axis],
                 self.face_kind[axis],
                 kinds.STEP[axis],
-                dt / (self.density * grid.dx[axis]),
+                factor / (self.density * grid.dx[axis]),
                 self._part(axis),
-                self.velocity[axis],
+                solved[axis],
             )
         if self.extras is not None:
             self._extra_pressure = x[n_cells:].copy()
             self.extras.project(
                 self.velocity_star, self._extra_pressure, self.layout.start + n_cells, self.pressure, self.index,
-                dt / (self.density * grid.dx), self.velocity, self.comm,
+                factor / (self.density * grid.dx), solved, self.comm,
             )  # fmt: skip
         if self.extras is not None or self._other_pressure is not None:
             self._remember_extras()
-        self._complete()
+        self._complete_faces(solved)
+        self.velocity = self._transport.accept(self.velocity, solved, self.face_kind, dt, self._complete_faces)
+        if self.smoke is not None:
+            self._complete_cells(self.smoke)
 
     def _remember_extras(self) -> None:
         """Keep the pressure of the second piece of split cells where the next step's cells can find it."""
@@ -412,12 +383,15 @@ class MacFluid(FluidField):
 
     def _complete(self) -> None:
         """Fill ghosts, bands and what lies beyond the sides. Collective."""
-        for axis in self._axes:
-            self.grid.exchange_faces(axis, self.velocity[axis])
-            self._bands[axis].fill(self.velocity[axis])
-            self.grid.fill_sides(self.velocity[axis], axis)
+        self._complete_faces(self.velocity)
         if self.smoke is not None:
             self._complete_cells(self.smoke)
+
+    def _complete_faces(self, faces: list[np.ndarray]) -> None:
+        for axis in self._axes:
+            self.grid.exchange_faces(axis, faces[axis])
+            self._bands[axis].fill(faces[axis])
+            self.grid.fill_sides(faces[axis], axis)
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
         assert self._smoke_band is not None
@@ -458,17 +432,26 @@ class MacFluid(FluidField):
     # ---- checkpoint -------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Slab]:
-        """Return velocity, kinds, pressure and smoke: all that the next step reads."""
-        return {name: self.grid.slab(array, axis) for name, array, axis in self._stored()}
+        """Return velocity, kinds, pressure, smoke and the transport's past: all that the next step reads."""
+        arrays = {name: self.grid.slab(array, axis) for name, array, axis in [*self._stored(), *self._stored_past()]}
+        return arrays | ({"past_dt": scalar_slab(self.comm, self._transport.past_dt)} if self._transport.past else {})
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
-        for name, array, axis in self._stored():
+        for name, array, axis in [*self._stored(), *self._stored_past()]:
             self.grid.read_slab(read, name, array, axis)
             self.grid.halo.exchange(array, axis)
+        for _, array, axis in self._stored_past():
+            self.grid.fill_sides(array, axis)
+        if self._transport.past:
+            self._transport.past_dt = float(read("past_dt", (0,), (1,))[0])
         self.geometry_version += 1
         self._kinds_changed()
         self._complete()
+
+    def _stored_past(self) -> list[tuple[str, np.ndarray, int | None]]:
+        past = self._transport.past
+        return [(f"{name}_{'xyz'[axis]}", past[name][axis], axis) for name in past for axis in self._axes]
 
     def _stored(self) -> list[tuple[str, np.ndarray, int | None]]:
         """Return the names, local arrays and axes of what a checkpoint holds."""

@@ -10,7 +10,6 @@ from numba import njit
 
 from petfsi.fields.solid.materials import Material
 from petfsi.fields.solid.pattern import Pattern
-from petfsi.integrators import Coefficients
 
 #: Elements handled at a time: their tangents stay in a core's cache.
 CHUNK = 512
@@ -40,6 +39,25 @@ class Bodies:
     lumped: np.ndarray
     mass_damping: np.ndarray
     stiffness_damping: np.ndarray
+
+
+@dataclass(frozen=True)
+class State:
+    """What a step's right-hand side is made of, at all local nodes; each of shape (n, dim).
+
+    Attributes
+    ----------
+    displacement : ndarray
+        d, where forces and tangent are taken, m.
+    inertia : ndarray
+        V, m/s^2.
+    shift : ndarray
+        s, m.
+    """
+
+    displacement: np.ndarray
+    inertia: np.ndarray
+    shift: np.ndarray
 
 
 class Elements:
@@ -94,17 +112,16 @@ class Elements:
         lame, mu = np.full(len(F), self.bodies.lame[body]), np.full(len(F), self.bodies.mu[body])
         return self.bodies.material[body](F, lame, mu)
 
-    def assemble(
-        self, d: np.ndarray, u: np.ndarray, step: Coefficients, pattern: Pattern, values: np.ndarray, b: np.ndarray
-    ) -> None:
-        """Fill A's values and b with  A_M M + A_K K'  and  b_M M u - b_K K' u - K(d). Not collective.
+    def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
+        """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective.
+
+        a0 and a1 are the bodies' damping, C = a0 M + a1 K'.
 
         Parameters
         ----------
-        d, u : ndarray, shape (n, dim)
-            Displacement and velocity of all local nodes.
-        step : Coefficients
-            Of the integrator, per body.
+        at : State
+        a, k : float
+            1/s, s.
         pattern : Pattern
         values : ndarray, shape (len(pattern.indices),)
             Overwritten.
@@ -113,15 +130,13 @@ class Elements:
         """
         values[:] = 0.0
         b[:] = 0.0
-        table = np.empty((len(self.bodies.density), 4))
-        for column, factor in enumerate((step.A_M, step.A_K, step.b_M, step.b_K)):
-            table[:, column] = factor
+        A_M, A_K = a + self.bodies.mass_damping, k + self.bodies.stiffness_damping
         for begin, end, body in self.chunks():
-            _, P, C = self.respond(d, begin, end, body)
+            _, P, C = self.respond(at.displacement, begin, end, body)
             part = slice(begin, end)
             self._kernels.scatter(
-                self.cells[part], self.gradients[part], self.volume[part], P, C, u,
-                self.bodies.density[body] * self.mass_factors[body], table[body],
+                self.cells[part], self.gradients[part], self.volume[part], P, C,
+                at.inertia, at.shift, self.bodies.density[body] * self.mass_factors[body], A_M[body], A_K[body],
                 pattern.node_ptr, pattern.slots[part], values, b,
             )  # fmt: skip
 
@@ -158,8 +173,7 @@ def _compile(dim: int) -> SimpleNamespace:
         return F
 
     @njit(cache=True)
-    def scatter(cells, gradients, volume, P, C, u, mass, step, node_ptr, slots, values, b):
-        A_M, A_K, b_M, b_K = step
+    def scatter(cells, gradients, volume, P, C, inertia, shift, mass, A_M, A_K, node_ptr, slots, values, b):
         Cg = np.empty((dim, dim, dim))
         for e in range(cells.shape[0]):
             V = volume[e]
@@ -187,12 +201,12 @@ def _compile(dim: int) -> SimpleNamespace:
                             for J in range(dim):
                                 stiffness += gradients[e, a, J] * Cg[i, J, k]
                             entry = A_K * stiffness
-                            load = -b_K * stiffness
+                            load = -stiffness * shift[column, k]
                             if i == k:
                                 entry += A_M * m
-                                load += b_M * m
+                                load += m * inertia[column, k]
                             values[start + i * width + k] += entry
-                            b[row, i] += load * u[column, k]
+                            b[row, i] += load
                         if a == q:
                             for J in range(dim):
                                 b[row, i] -= V * P[e, i, J] * gradients[e, a, J]

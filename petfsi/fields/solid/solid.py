@@ -8,8 +8,8 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Reader, Slab, SolidField
-from petfsi.fields.solid.elements import Bodies, Elements
+from petfsi.fields.base import Reader, Slab, SolidField, scalar_slab
+from petfsi.fields.solid.elements import Bodies, Elements, State
 from petfsi.fields.solid.materials import MATERIALS, lame_parameters
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
@@ -18,7 +18,7 @@ from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.surfaces import Surface, boundary_facets, shells
-from petfsi.integrators import INTEGRATORS, Coefficients, Integrator
+from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage
 from petfsi.petsc import IntType, Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
@@ -26,9 +26,9 @@ from petfsi.scene.schema import Number, Scene, Solid
 
 
 class SimplexSolid(SolidField):
-    """The solids of a scene; the unknown is the velocity u of every node at the new time.
+    """The solids of a scene; the unknown is the velocity w of every node where the integrator takes the forces.
 
-    A step solves  A u = b + J p  (see ``integrators``) and moves the nodes by the integrator's rule. Unknown
+    A step solves  A w = b + J p  (see ``integrators``) and moves the nodes by the integrator's rule. Unknown
     ``dim * node + axis`` in the partition's numbering.
 
     Attributes
@@ -73,7 +73,10 @@ class SimplexSolid(SolidField):
         thrown = {name: ("velocity", start.velocity) for name, start in initial.items()}
         self.displacement = _evaluate(moved, mesh.points, node_body)[mine]
         self.velocity = _evaluate(thrown, mesh.points, node_body)[mine]
-        self._prescribe(0.0)
+        self._stage: Stage | None = None
+        self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
+        self._past_dt = 0.0
+        self._prescribed = self._supports.velocities(0.0).copy()
         held = self._supports.unknowns
         here = (held >= self.layout.start) & (held < self.layout.end)
         self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
@@ -93,8 +96,7 @@ class SimplexSolid(SolidField):
             vector.setArray(mode)
             vectors.append(vector)
         self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
-        self._dt = 0.0
-        self._diagonal = 1.0
+        self._diagonal = (0.0, 0.0), 1.0
 
     def _set_exchange(self, mesh: SimplexMesh, number: np.ndarray) -> None:
         """Prepare the messages between owned, shared and naturally ordered nodes, and the static output."""
@@ -138,34 +140,40 @@ class SimplexSolid(SolidField):
     # ---- the step ---------------------------------------------------------------------------------------------
 
     def unknown(self) -> np.ndarray:
-        """Return the velocities of this rank's nodes, flat."""
-        return self.velocity.ravel().copy()
+        """Return w of the step last accepted, flat."""
+        return self._integrator.solved(self._motion()).ravel().copy()
 
     def predict(self, time: float, dt: float) -> None:
-        """Do nothing: all of a solid's step is implicit."""
+        """Take the geometry of the step: from here until ``accept`` the surface is where the tangent is taken."""
+        self._stage = self._integrator.stage(self._motion(), dt)
 
     def assemble(self, time: float, dt: float) -> None:
-        """Refresh A and b for the step from ``time`` to ``time + dt``; forces and supports at its end. Collective."""
-        step = self._coefficients(dt)
-        if dt != self._dt:
-            self._dt, self._diagonal = dt, self._mean_diagonal(step)
+        """Refresh A and b for the step from ``time`` to ``time + dt``. Collective."""
+        stage = self._stage or self._integrator.stage(self._motion(), dt)
         b = self.rhs.reshape(-1, self.dim)
-        local = self._with_shared(np.concatenate((self.displacement, self.velocity), axis=1))
-        d, u = local[:, : self.dim], local[:, self.dim :]
-        self._elements.assemble(d, u, step, self._pattern, self._values, b)
+        diagonal = self._mean_diagonal(stage)
+        local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
+        state = State(*(local[:, n * self.dim : (n + 1) * self.dim] for n in range(3)))
+        self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
         for axis, g in enumerate(self._gravity):
-            b[:, axis] += self._nodal_mass * float(g(t=time + dt))
-        self._prescribe(time + dt)
-        self._elimination.apply(self._values, self.rhs, self._prescribed, self._diagonal)
+            b[:, axis] += self._nodal_mass * float(g(t=time + self._integrator.moment(dt)))
+        self._prescribe(time, dt)
+        self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
         set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
         self.row_scale = dt / self._reference_mass
         self.n_assembled += 1
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
-        """Take the new velocities and move the nodes."""
-        new = x.reshape(-1, self.dim).copy()
-        self.displacement = self._integrator.displacement(self.displacement, self.velocity, new, dt)
-        self.velocity = new
+        """Take the velocities w and move the nodes."""
+        w, motion = x.reshape(-1, self.dim).copy(), self._motion()
+        stage = self._stage or self._integrator.stage(motion, dt)
+        motion = self._integrator.finish(motion, stage, w, dt)
+        self.displacement, self.velocity = motion.displacement, motion.velocity
+        self._past, self._past_dt = motion.past, motion.past_dt
+        self._stage = None
+
+    def _motion(self) -> Motion:
+        return Motion(self.displacement, self.velocity, self._past, self._past_dt)
 
     def set_scale(self, reference_mass: float) -> None:
         """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``."""
@@ -181,20 +189,22 @@ class SimplexSolid(SolidField):
             modes.append(turn)
         return [mode.ravel() for mode in modes]
 
-    def _coefficients(self, dt: float) -> Coefficients:
-        bodies = self._elements.bodies
-        return self._integrator.coefficients(dt, bodies.mass_damping, bodies.stiffness_damping)
+    def _mean_diagonal(self, stage: Stage) -> float:
+        """Return the mean of A's diagonal at rest: what stands in the rows of prescribed unknowns. Collective."""
+        factors, diagonal = self._diagonal
+        if factors != (stage.a, stage.k):
+            rest, b = np.zeros_like(self._mesh.points), np.empty_like(self.reference)
+            state = State(rest, rest, rest)
+            self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
+            rows = np.repeat(np.arange(self.layout.n_local), np.diff(self._pattern.indptr))
+            total = self._values[self._pattern.indices == rows + self.layout.start].sum()
+            diagonal = self.comm.allreduce(float(total)) / self.layout.n_global
+            self._diagonal = (stage.a, stage.k), diagonal
+        return diagonal
 
-    def _mean_diagonal(self, step: Coefficients) -> float:
-        """Return the mean of A's diagonal at rest: what stands in the rows of prescribed unknowns."""
-        rest, b = np.zeros_like(self._mesh.points), np.empty_like(self.reference)
-        self._elements.assemble(rest, rest, step, self._pattern, self._values, b)
-        rows = np.repeat(np.arange(self.layout.n_local), np.diff(self._pattern.indptr))
-        total = self._values[self._pattern.indices == rows + self.layout.start].sum()
-        return self.comm.allreduce(float(total)) / self.layout.n_global
-
-    def _prescribe(self, time: float) -> None:
-        self._prescribed = self._supports.velocities(time)
+    def _prescribe(self, time: float, dt: float) -> None:
+        instants = self._integrator.instants(dt)
+        self._prescribed = np.mean([self._supports.velocities(time + t).copy() for t in instants], axis=0)
 
     def _with_shared(self, owned: np.ndarray) -> np.ndarray:
         """Return values at all nodes of this rank's elements. Collective."""
@@ -207,15 +217,19 @@ class SimplexSolid(SolidField):
         return self._surface
 
     def surface_positions(self) -> np.ndarray:
-        """Return the present positions of the surface's points, shape (n_points, dim). Collective."""
-        return self._gather_surface(self.reference[self._wet] + self.displacement[self._wet])
+        """Return the positions of the surface's points, shape (n_points, dim). Collective.
+
+        From ``predict`` to ``accept`` those where the step's tangent is taken, otherwise the present ones.
+        """
+        displacement = self._stage.tangent_at if self._stage else self.displacement
+        return self._gather_surface(self.reference[self._wet] + displacement[self._wet])
 
     def surface_velocity(self) -> np.ndarray:
-        """Return the present velocities of the surface's points, shape (n_points, dim). Collective."""
-        return self._gather_surface(self.velocity[self._wet])
+        """Return w of the step last accepted at the surface's points, shape (n_points, dim). Collective."""
+        return self._gather_surface(self._integrator.solved(self._motion())[self._wet])
 
     def fixed_velocity(self) -> np.ndarray:
-        """Return the prescribed velocities at the end of the step last assembled, zero at free unknowns."""
+        """Return w of the step last assembled at prescribed unknowns, zero at free ones."""
         g = np.zeros(self.layout.n_global)
         g[self._supports.unknowns] = self._prescribed
         return g
@@ -264,22 +278,32 @@ class SimplexSolid(SolidField):
         return self._places[key].value(self.comm, self._mesh, getattr(self, quantity))
 
     def state(self) -> dict[str, Slab]:
-        """Return displacement and velocity in the mesh's own order. Collective."""
-        return {
-            "displacement": self._rows(self._to_natural(self.displacement)),
-            "velocity": self._rows(self._to_natural(self.velocity)),
-        }
+        """Return displacement, velocity and what the integrator remembers, in the mesh's own order. Collective."""
+        past = dict(zip(self._integrator.past, map(self._natural_rows, self._past), strict=True))
+        return self._present() | past | ({"past_dt": scalar_slab(self.comm, self._past_dt)} if past else {})
 
     def restore(self, read: Reader) -> None:
-        """Take displacement and velocity back. Collective."""
+        """Take the state back. Collective."""
         begin, end, _ = self._slab
-        for name in ("displacement", "velocity"):
-            rows = np.asarray(read(name, (begin, 0), (end - begin, self.dim)), dtype=float)
-            setattr(self, name, self._from_natural(rows))
+
+        def nodes(name: str) -> np.ndarray:
+            return self._from_natural(np.asarray(read(name, (begin, 0), (end - begin, self.dim)), dtype=float))
+
+        self.displacement, self.velocity = nodes("displacement"), nodes("velocity")
+        self._past = tuple(nodes(name) for name in self._integrator.past)
+        if self._past:
+            self._past_dt = float(read("past_dt", (0,), (1,))[0])
+        self._stage = None
 
     def output(self) -> dict[str, Slab]:
         """Return points, cells and body, which never change, and displacement and velocity. Collective."""
-        return self._static | self.state()
+        return self._static | self._present()
+
+    def _present(self) -> dict[str, Slab]:
+        return {"displacement": self._natural_rows(self.displacement), "velocity": self._natural_rows(self.velocity)}
+
+    def _natural_rows(self, owned: np.ndarray) -> Slab:
+        return self._rows(self._to_natural(owned))
 
     def _rows(self, rows: np.ndarray) -> Slab:
         begin, _, n = self._slab

@@ -1,0 +1,317 @@
+"""How a fluid's velocity and smoke are carried along: one scheme for each integrator.
+
+Every scheme gives the velocity v* of which the pressure makes the step's solution, with c = 1/a of the integrator,
+
+    v_w = v* - (c/rho) G p,     v* = (what is carried to the faces) + c g,
+
+and v_w is the velocity at the instant where the integrator takes the forces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.errors import SolveError
+from petfsi.fields.mac import advect, kinds
+from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.sides import Surroundings
+from petfsi.integrators import Bdf2, Midpoint, Newmark
+
+#: Cells that the flow may cross in one sweep: with the half cell of staggering and the stencil, all within the ghosts.
+MAX_COURANT = {"linear": 4.0, "cubic": 3.0}
+#: Times that it may cross the whole grid in one step; more is no flow any longer.
+MAX_CROSSINGS = 10
+
+#: An array of faces per axis.
+Faces = list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Path:
+    """A flow that stands still for a time, in sweeps that are short enough.
+
+    Attributes
+    ----------
+    velocity : list of ndarray
+        Face arrays, ghosts valid.
+    span : float
+        How long it carries, s.
+    sweeps : int
+    """
+
+    velocity: Faces
+    span: float
+    sweeps: int
+
+
+class Advection:
+    """Carries arrays along paths; what differs between the schemes is where and how long.
+
+    Parameters
+    ----------
+    grid : MacGrid
+    surroundings : Surroundings
+        Know what smoke comes in.
+    interpolation : str
+        ``cubic`` or ``linear``.
+    """
+
+    def __init__(self, grid: MacGrid, surroundings: Surroundings, interpolation: str) -> None:
+        self.grid, self.surroundings = grid, surroundings
+        self.cubic = interpolation == "cubic"
+        self.reach = MAX_COURANT[interpolation]
+        place = list(zip(grid.periodic, grid.ghost, grid.lo, grid.cells, grid.shape(None), strict=True))
+        # a departure point in a ghost cell of another rank or a periodic axis is as good as any
+        self._low = tuple(0.0 if p else float(max(0, g - m)) for p, g, m, _, _ in place)
+        self._high = tuple(float(s) if p else float(min(s, g - m + c)) for p, g, m, c, s in place)
+
+    def path(self, velocity: Faces, span: float) -> Path:
+        """Return the path along a velocity for ``span`` seconds. Collective: one reduction.
+
+        Raises
+        ------
+        SolveError
+            If it crosses the grid so often that it is no flow any longer.
+        """
+        grid = self.grid
+        most = max(advect.largest(v) * span / h for v, h in zip(velocity, grid.dx, strict=True))
+        courant = grid.comm.allreduce(most, op=MPI.MAX)
+        if not courant <= MAX_CROSSINGS * max(grid.cells):
+            raise SolveError(
+                f"the flow has blown up: it would cross {courant:.1e} cells, more than the whole grid "
+                f"{MAX_CROSSINGS} times, in one step of {span:g} s. Take a smaller dt, or look at what drives it."
+            )
+        return Path(velocity, span, max(1, int(np.ceil(courant / self.reach))))
+
+    def carry(self, q: np.ndarray, path: Path, moved: np.ndarray, axis: int | None, out: np.ndarray) -> None:
+        """Carry q (faces of an axis; None: smoke in cells) into the owned part of ``out``. Collective.
+
+        Parameters
+        ----------
+        q : ndarray
+            Ghosts valid.
+        path : Path
+        moved : ndarray of bool
+            Where; elsewhere ``out`` is q.
+        axis : int or None
+        out : ndarray
+        """
+        grid = self.grid
+        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
+        courant = (*(path.span / path.sweeps / grid.dx), 0.0)[:3]
+        part = tuple((s.start, s.stop) for s in grid.owned(axis))
+        # smoke comes in from behind the sides, where the ghosts know what a jet carries
+        beyond = 0.5 if axis is None else 0.0
+        u, v, w = three(path.velocity)
+        for number in range(path.sweeps):
+            target = out if number == path.sweeps - 1 else np.empty_like(q)
+            low, high, bounded = self._low, self._high, axis is None
+            advect.sweep(
+                q, target, moved, u, v, w, offset, part, courant, low, high, beyond, self.cubic, bounded
+            )  # fmt: skip
+            if number < path.sweeps - 1:
+                grid.halo.exchange(target, axis)
+                if axis is None:
+                    self.surroundings.fill_smoke(target)
+                else:
+                    grid.fill_sides(target, axis)
+                q = target
+
+
+class Transport:
+    """First order, for Newmark's scheme:  v*(x) = v^n(x_d), where x_d comes to x along v^n.
+
+    Attributes
+    ----------
+    past : dict of str to list of ndarray
+        Face arrays, ghosts valid, that the next step reads besides the velocity; not read while ``past_dt`` is zero.
+    past_dt : float
+        Length of the last step, s; zero before the first.
+    """
+
+    names: tuple[str, ...] = ()
+
+    def __init__(self, advection: Advection) -> None:
+        self.integrator: Newmark | Bdf2 | Midpoint = Newmark()
+        self.advection = advection
+        self.grid = advection.grid
+        self.past: dict[str, Faces] = {
+            name: [self.grid.zeros_faces(axis) for axis in range(self.grid.dim)] for name in self.names
+        }
+        self.past_dt = 0.0
+        self._whole: Path | None = None  # of the step being predicted, where it was needed
+
+    def factor(self, dt: float) -> float:
+        """Return c, s."""
+        return self.integrator.factor(dt, self.past_dt)
+
+    def moment(self, dt: float) -> float:
+        """Return how long after the step's begin v_w holds, s."""
+        return self.integrator.moment(dt)
+
+    def solved(self, velocity: Faces) -> Faces:
+        """Return v_w of the last step, which has no divergence, given the velocity at its end."""
+        return velocity
+
+    def half_way(self, velocity: Faces, dt: float) -> Faces:
+        """Return the flow that carries from the step's begin to its end, given that at its begin."""
+        return velocity
+
+    def predict(self, velocity: Faces, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+        """Write what is carried to the owned faces into ``star``. Collective."""
+        self._whole = self.advection.path(self.half_way(velocity, dt), dt)
+        for axis, v in enumerate(velocity):
+            self.advection.carry(v, self._whole, moved[axis], axis, star[axis])
+
+    def carry_smoke(self, smoke: np.ndarray, velocity: Faces, moved: np.ndarray, dt: float) -> np.ndarray:
+        """Return the smoke at the end of the step that was predicted, in the owned cells. Collective."""
+        out = np.empty_like(smoke)
+        path = self._whole or self.advection.path(self.half_way(velocity, dt), dt)
+        self.advection.carry(smoke, path, moved, None, out)
+        return out
+
+    def accept(
+        self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
+    ) -> Faces:
+        """Return the velocity at the step's end, and remember what the next one reads. Collective.
+
+        Parameters
+        ----------
+        velocity : list of ndarray
+            At the step's begin.
+        solved : list of ndarray
+            v_w, complete.
+        kind : list of ndarray of uint8
+            Of the faces.
+        dt : float
+            s.
+        complete : callable
+            Fills ghosts and bands of face arrays.
+        """
+        self.past_dt = dt
+        return solved
+
+
+class Bdf2Transport(Transport):
+    """Second order, for BDF2:  v*(x) = b v^n(x_d) - b' v^{n-1}(x_dd) + c g  with b, b' and c of ``Bdf2``.
+
+    For equal steps (4 v^n(x_d) - v^{n-1}(x_dd))/3. Both points come to x in straight time, from t^n and from
+    t^{n-1}, along the velocity on the line through v^{n-1} and v^n at the middle of either span. The first step is
+    of first order.
+
+    References
+    ----------
+    D. Xiu, G. E. Karniadakis, A semi-Lagrangian high-order method for Navier-Stokes equations (2001), section 2.
+    """
+
+    names = ("velocity_before",)
+
+    def __init__(self, advection: Advection) -> None:
+        super().__init__(advection)
+        self.scheme = self.integrator = Bdf2()
+
+    def half_way(self, velocity: Faces, dt: float) -> Faces:
+        """Return the velocity at t^n + dt/2."""
+        return self._at(velocity, dt / 2)
+
+    def _at(self, velocity: Faces, later: float) -> Faces:
+        """Return the velocity a time after t^n, on the line through v^{n-1} and v^n."""
+        if self.past_dt == 0.0 or later == 0.0:
+            return velocity
+        s = later / self.past_dt
+        return [v + s * (v - before) for v, before in zip(velocity, self.past["velocity_before"], strict=True)]
+
+    def predict(self, velocity: Faces, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+        """Write b v^n(x_d) - b' v^{n-1}(x_dd) into the owned part of ``star``. Collective."""
+        super().predict(velocity, moved, dt, star)
+        if self.past_dt == 0.0:
+            return
+        b, b_past = self.scheme.weights(dt, self.past_dt)
+        far = self.advection.path(self._at(velocity, (dt - self.past_dt) / 2), dt + self.past_dt)
+        for axis, before in enumerate(self.past["velocity_before"]):
+            carried = np.empty_like(before)
+            self.advection.carry(before, far, moved[axis], axis, carried)
+            own = self.grid.owned(axis)
+            star[axis][own] = b * star[axis][own] - b_past * carried[own]
+
+    def accept(
+        self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
+    ) -> Faces:
+        """Return v_w; the old velocity becomes the one before."""
+        self.past["velocity_before"], self.past_dt = velocity, dt
+        return solved
+
+
+class MidpointTransport(Transport):
+    """Second order, for the midpoint rule: half a step of transport, a whole kick, half a step of transport.
+
+    Two halves with no kick between them are one, from the middle of a step, where v'' is what the last kick left, to
+    that of the next:
+
+        v'(x) = v''(x_d),    v_w = v' + (h/2)(g - G p / rho),    v'' = 2 v_w - v' .
+
+    Paths, and the velocity that others see at the ends of steps, lie on the line through the last two v_w. Where a
+    face has its velocity given, v'' is the one at the step's end.
+
+    References
+    ----------
+    G. Strang, On the construction and comparison of difference schemes (1968).
+    """
+
+    names = ("velocity_middle", "velocity_kicked")
+
+    def __init__(self, advection: Advection) -> None:
+        super().__init__(advection)
+        self.scheme = self.integrator = Midpoint()
+        self._carried: Faces = []
+
+    def solved(self, velocity: Faces) -> Faces:
+        """Return the velocity in the middle of the last step."""
+        return self.past["velocity_middle"] if self.past_dt else velocity
+
+    def half_way(self, velocity: Faces, dt: float) -> Faces:
+        """Return the velocity in the middle of the coming step."""
+        return self._at(velocity, dt / 2)
+
+    def _at(self, velocity: Faces, later: float) -> Faces:
+        """Return the velocity a time after t^n, on the line through that and the middle of the last step."""
+        pairs = zip(velocity, self.past["velocity_middle"], strict=True)
+        return [self.scheme.later(v, w, later, self.past_dt) for v, w in pairs]
+
+    def predict(self, velocity: Faces, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+        """Write v' into the owned part of ``star``, and keep it for the kick. Collective."""
+        between = (self.past_dt + dt) / 2
+        path = self.advection.path(self._at(velocity, (dt - self.past_dt) / 4), between)
+        kicked = self.past["velocity_kicked"] if self.past_dt else velocity
+        for axis, v in enumerate(kicked):
+            self.advection.carry(v, path, moved[axis], axis, star[axis])
+        self._carried = [v.copy() for v in star]
+
+    def accept(
+        self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
+    ) -> Faces:
+        """Return the velocity at the step's end. Collective."""
+        pairs = zip(solved, self.solved(velocity), strict=True)
+        ahead = [self.scheme.ahead(w, before, dt, self.past_dt) for w, before in pairs]
+        complete(ahead)
+        given = [(k == kinds.WALL) | (k == kinds.SOLID_FACE) for k in kind]
+        kicked = [
+            np.where(where, end, 2 * w - start)
+            for where, end, w, start in zip(given, ahead, solved, self._carried, strict=True)
+        ]
+        complete(kicked)
+        self.past = {"velocity_middle": solved, "velocity_kicked": kicked}
+        self.past_dt, self._carried = dt, []
+        return ahead
+
+
+#: The scene's ``time.integrator`` by name.
+TRANSPORTS: dict[str, type[Transport]] = {
+    "newmark": Transport,
+    "bdf2": Bdf2Transport,
+    "midpoint": MidpointTransport,
+}
