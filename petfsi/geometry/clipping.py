@@ -18,8 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from petfsi.geometry.pieces import Box, find_pieces
 from petfsi.geometry.slabs import (
     MOST,
+    PLANE,
     area_vectors,
     clip_polygon,
     clip_segment,
@@ -141,6 +143,8 @@ class Patches(NamedTuple):
         ``image`` counts the periodic images of the surface.
     cell : ndarray of int64, shape (n,)
         Flat index in the box with its margin.
+    edges : ndarray of int8, shape (n,)
+        Bit i says that the patch has something of the facet's edge i (corner i in 2D).
     values : ndarray, shape (n, dim + dim * dim + dim + 1)
         Integrals, moments, the area vector over the cell's faces, and int x_a dA_a for the last axis a, in units of
         cells about the cell's centre.
@@ -149,6 +153,7 @@ class Patches(NamedTuple):
     facet: np.ndarray
     image: np.ndarray
     cell: np.ndarray
+    edges: np.ndarray
     values: np.ndarray
 
 
@@ -174,34 +179,35 @@ def cut(points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0)
     lo, hi = (np.asarray(end, dtype=np.int64) for end in (lattice.lo, lattice.hi))
     frame = Frame(lo - 1, hi + 1, dx, area / np.where(size > 0.0, size, 1.0))
     facets = np.ascontiguousarray(facets, dtype=np.int32)
-    patches, sums = _find_patches(x, facets, frame, _images(x, facets, lattice, frame))
-    count = np.bincount(patches.cell, minlength=int(np.prod(frame.hi - frame.lo)))
-    patches = Patches(*_sort(*patches, count))
-    opening = _open_faces(sums, count.reshape(frame.hi - frame.lo) > 0, base)
-    inner = _inner(patches.cell, frame.hi - frame.lo)
-    cell = _box_cell(patches.cell, frame.hi - frame.lo)
+    images = _images(x, facets, lattice, frame)
+    patches, sums = _find_patches(x, facets, frame, images)
+    shape = frame.hi - frame.lo
+    count = np.bincount(patches.cell, minlength=int(np.prod(shape)))
+    order = _order(patches.cell, count)
+    patches = Patches(*(part[order] for part in patches))
+    opening = _open_faces(sums, count.reshape(shape) > 0, base)
+    inner, cell = _box_cells(patches.cell, shape)
+    box = Box(frame.lo, shape, images)
+    pieces = find_pieces(x, facets, box, patches, inner, opening)
     some = inner & (np.abs(patches.values[:, :dim]).sum(axis=1) > 0.0)
-    flux = np.bincount(cell[some], weights=patches.values[some, -1], minlength=int(np.prod(hi - lo)))
-    low, high = (np.take(opening[-1], range(s, s + (hi - lo)[-1]), axis=-1) for s in (0, 1))
-    volume = np.clip(0.5 * (low + high) - flux.reshape(hi - lo), 0.0, 1.0)
-    none = np.zeros(0, dtype=np.int32)
+    cell, values = cell[some], patches.values[some]
     return CutCells(
         facet=patches.facet[some],
-        cell=cell[some],
-        piece=np.zeros(np.count_nonzero(some), dtype=np.int32),
-        integrals=np.ascontiguousarray(patches.values[some, :dim]),
-        moments=patches.values[some, dim : dim + dim * dim].reshape(-1, dim, dim),
+        cell=cell,
+        piece=pieces.patch_piece[some],
+        integrals=np.ascontiguousarray(values[:, :dim]),
+        moments=values[:, dim : dim + dim * dim].reshape(-1, dim, dim),
         normals=frame.normals,
         open=opening,
-        volume=volume,
-        extra_cell=none.astype(np.int64),
-        extra_piece=none,
-        extra_volume=np.zeros(0),
-        link_axis=none,
-        link_face=none.astype(np.int64),
-        link_below=none,
-        link_above=none,
-        link_open=np.zeros(0),
+        volume=_volumes(cell, values[:, -1], opening[-1]),
+        extra_cell=_box_cells(pieces.extra_cell, shape)[1],
+        extra_piece=pieces.extra_piece,
+        extra_volume=pieces.extra_volume,
+        link_axis=pieces.link_axis,
+        link_face=_box_faces(pieces.link_cell, pieces.link_axis, shape),
+        link_below=pieces.link_below,
+        link_above=pieces.link_above,
+        link_open=pieces.link_open,
     )
 
 
@@ -242,11 +248,13 @@ def _find_patches(
     for number, shift in enumerate(images):
         # it is the box that is moved, not the surface: an image's patches are the original's to the last bit
         moved = Frame(frame.lo - shift, frame.hi - shift, frame.dx, frame.normals)
-        facet, cell, values = kernel(x, facets, moved, *sums)
-        found.append(Patches(facet, np.full(len(facet), number, dtype=np.int32), cell, values))
+        facet, cell, edges, values = kernel(x, facets, moved, *sums)
+        found.append(Patches(facet, np.full(len(facet), number, dtype=np.int32), cell, edges, values))
     if not found:
         none = np.zeros(0, dtype=np.int32)
-        return Patches(none, none, none.astype(np.int64), np.zeros((0, dim * (dim + 2) + 1))), sums
+        return Patches(
+            none, none, none.astype(np.int64), none.astype(np.int8), np.zeros((0, dim * (dim + 2) + 1))
+        ), sums
     return (
         found[0] if len(found) == 1 else Patches(*(np.concatenate(part) for part in zip(*found, strict=True)))
     ), sums
@@ -268,50 +276,75 @@ def _open_faces(sums: list[np.ndarray], touched: np.ndarray, base: int) -> list[
     return opening
 
 
-def _inner(cell: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return which cells of a box with margin are none of the margin's."""
-    index = np.array(np.unravel_index(cell, shape)).reshape(len(shape), -1)
-    return np.all((index > 0) & (index < shape[:, None] - 1), axis=0)
+def _volumes(cell: np.ndarray, flux: np.ndarray, opening: np.ndarray) -> np.ndarray:
+    """Return the open fraction of the box's cells by the divergence theorem along the last axis.
+
+    ``flux`` is int x_a dA_a of each patch, ``opening`` the open fraction of the faces normal to that axis.
+    """
+    low, high = opening[..., :-1], opening[..., 1:]
+    inside = np.bincount(cell, weights=flux, minlength=low.size).reshape(low.shape)
+    return np.clip(0.5 * (low + high) - inside, 0.0, 1.0)
 
 
-def _box_cell(cell: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return the flat index in a box of cells given in the box with its margin; nonsense for those of the margin."""
+def _box_cells(cell: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which cells of the box with its margin are the box's, and their flat index in it (else nonsense)."""
     index = np.array(np.unravel_index(cell, shape)).reshape(len(shape), -1) - 1
-    return np.ravel_multi_index(tuple(index), tuple(shape - 2), mode="clip").astype(np.int64)
+    inner = np.all((index >= 0) & (index < shape[:, None] - 2), axis=0)
+    return inner, np.ravel_multi_index(tuple(index), tuple(shape - 2), mode="clip").astype(np.int64)
+
+
+def _box_faces(above: np.ndarray, axis: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return the flat index of faces among the box's faces of their axis; ``above`` are cells of box and margin."""
+    index = np.array(np.unravel_index(above, shape)).reshape(len(shape), -1) - 1
+    face = np.zeros(len(above), dtype=np.int64)
+    for a in range(len(shape)):
+        mine = axis == a
+        face[mine] = np.ravel_multi_index(tuple(index[:, mine]), tuple(shape - 2 + (np.arange(len(shape)) == a)))
+    return face
 
 
 @njit(cache=True)
-def _sort(facet, image, cell, values, count):
-    """Return the patches sorted by cell, those of one cell in their old order; ``count`` is how many each cell has."""
-    n = len(cell)
+def _order(cell, count):
+    """Return the order of patches by cell, those of one cell as they are; ``count`` is how many each cell has."""
     position = np.cumsum(count) - count
-    new_facet, new_image = np.empty_like(facet), np.empty_like(image)
-    new_cell, new_values = np.empty_like(cell), np.empty_like(values)
-    for i in range(n):
-        j = position[cell[i]]
+    order = np.empty(len(cell), np.int64)
+    for i in range(len(cell)):
+        order[position[cell[i]]] = i
         position[cell[i]] += 1
-        new_facet[j], new_image[j], new_cell[j] = facet[i], image[i], cell[i]
-        new_values[j] = values[i]
-    return new_facet, new_image, new_cell, new_values
+    return order
 
 
 @njit(cache=True)
-def _grown(facet, cell, values):
+def _room(n, width):
+    """Return facet, cell, edges and values for n patches."""
+    return np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n, np.int8), np.empty((n, width))
+
+
+@njit(cache=True)
+def _grown(facet, cell, edges, values):
     """Return twice the room."""
     n = len(facet)
-    more_facet, more_cell = np.empty(2 * n, facet.dtype), np.empty(2 * n, cell.dtype)
-    more_values = np.empty((2 * n, values.shape[1]))
-    more_facet[:n], more_cell[:n], more_values[:n] = facet, cell, values
-    return more_facet, more_cell, more_values
+    more = _room(2 * n, values.shape[1])
+    more[0][:n], more[1][:n], more[2][:n], more[3][:n] = facet, cell, edges, values
+    return more
+
+
+@njit(cache=True)
+def _own_edges(tags, n):
+    """Return one bit for each of the facet's edges that is among the tags."""
+    bits = 0
+    for i in range(n):
+        if tags[i] < PLANE:
+            bits |= 1 << tags[i]
+    return bits
 
 
 @njit(cache=True)
 def _clip_3d(x, facets, frame, sums0, sums1, sums2):
-    """Return facet, cell and values of the patches of triangles; add their area vectors to the sums."""
+    """Return facet, cell, edges and values of the patches of triangles; add their area vectors to the sums."""
     lo, hi = frame.lo, frame.hi
     ny, nz = hi[1] - lo[1], hi[2] - lo[2]
-    room = 3 * len(facets) + 64
-    facet, cell, values = np.empty(room, np.int32), np.empty(room, np.int64), np.empty((room, 16))
+    facet, cell, edges, values = _room(3 * len(facets) + 64, 16)
     part, tags = np.empty((4, MOST, 6)), np.empty((4, MOST), np.int64)
     at, value = np.empty(3, np.int64), np.empty(16)
     count = 0
@@ -347,19 +380,18 @@ def _clip_3d(x, facets, frame, sums0, sums1, sums2):
                     if i_ < 0 or j_ < 0 or k_ < 0:
                         continue
                     if count == len(facet):
-                        facet, cell, values = _grown(facet, cell, values)
+                        facet, cell, edges, values = _grown(facet, cell, edges, values)
                     facet[count], cell[count] = f, (i_ * ny + j_) * nz + k_
-                    values[count] = value
+                    edges[count], values[count] = _own_edges(tags[3], o), value
                     count += 1
-    return facet[:count].copy(), cell[:count].copy(), values[:count].copy()
+    return facet[:count].copy(), cell[:count].copy(), edges[:count].copy(), values[:count].copy()
 
 
 @njit(cache=True)
 def _clip_2d(x, facets, frame, sums0, sums1):
-    """Return facet, cell and values of the patches of segments; add their area vectors to the sums."""
+    """Return facet, cell, edges and values of the patches of segments; add their area vectors to the sums."""
     lo, hi = frame.lo, frame.hi
-    room = 3 * len(facets) + 64
-    facet, cell, values = np.empty(room, np.int32), np.empty(room, np.int64), np.empty((room, 9))
+    facet, cell, edges, values = _room(3 * len(facets) + 64, 9)
     part, tags = np.empty((3, 2, 4)), np.empty((3, 2), np.int64)
     at, value = np.empty(2, np.int64), np.empty(9)
     count = 0
@@ -385,11 +417,11 @@ def _clip_2d(x, facets, frame, sums0, sums1):
                 if i_ < 0 or j_ < 0:
                     continue
                 if count == len(facet):
-                    facet, cell, values = _grown(facet, cell, values)
+                    facet, cell, edges, values = _grown(facet, cell, edges, values)
                 facet[count], cell[count] = f, i_ * (hi[1] - lo[1]) + j_
-                values[count] = value
+                edges[count], values[count] = _own_edges(tags[2], 2), value
                 count += 1
-    return facet[:count].copy(), cell[:count].copy(), values[:count].copy()
+    return facet[:count].copy(), cell[:count].copy(), edges[:count].copy(), values[:count].copy()
 
 
 @njit(cache=True)
