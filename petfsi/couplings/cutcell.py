@@ -15,6 +15,7 @@ from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
+    from petfsi.fields.mac.cut import Wet
     from petfsi.fields.mac.fluid import MacFluid
 
 
@@ -58,7 +59,7 @@ class CutCellCoupling(Coupling):
         if self._positions is not None and np.array_equal(positions, self._positions):
             return
         self._positions = positions.copy()
-        walls = self.fluid.cut(positions, self.facets)
+        walls, wet = self.fluid.cut(positions, self.facets)
         layout = self.fluid.layout
         points = self.facets[walls.facet] * self.dim + walls.axis[:, None]
         rows = np.repeat(walls.slot - layout.start, self.dim)
@@ -71,8 +72,24 @@ class CutCellCoupling(Coupling):
         cells = layout.start + np.repeat(np.arange(layout.n_local), np.diff(flux.indptr))
         force = gather_triplets(self.comm, self.solid.layout, columns, cells, -flux.data)
         self._rows = [(flux.indptr.astype(IntType), columns, flux.data), force]
+        if self.fluid.weight is not None:
+            self._weight = self._rest_force(wet)
         self._stale = True
         self.n_coupled += 1
+
+    def _rest_force(self, wet: Wet) -> csr_matrix:
+        """Return the force of a linear pressure, zero in the grid's upper corner, by its gradient. Collective.
+
+        Shape (unknowns of the solid on this rank, dim), m^3 (m^2 in 2D):  -∫ N_i n (x_b - x_0,b) dA.
+        """
+        dim, layout = self.dim, self.solid.layout
+        points = (self.facets[wet.facet] * dim)[:, :, None] + np.arange(dim)
+        rows = np.repeat(points.ravel(), dim)
+        columns = np.tile(np.arange(dim), points.size)
+        by_point = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))
+        force = (self._free_map.T @ by_point).tocoo()
+        rows = gather_triplets(self.comm, layout, self._free[force.row], force.col.astype(np.int64), force.data)
+        return csr_matrix((rows[2], rows[1], rows[0]), shape=(layout.n_local, dim))
 
     def assemble(self, time: float, dt: float) -> None:
         """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
@@ -84,6 +101,8 @@ class CutCellCoupling(Coupling):
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
             self.fluid.rhs -= self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+        if self.fluid.weight is not None:
+            self.solid.rhs += self._weight @ self.fluid.weight.gradient
 
     def _fill(self) -> None:
         patterns: list[tuple[np.ndarray, ...]] = [rows[:2] for rows in self._rows]

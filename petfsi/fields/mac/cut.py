@@ -58,6 +58,28 @@ class Walls:
 
 
 @dataclass(frozen=True)
+class Wet:
+    """The patches of moving facets that bound fluid in this rank's cells.
+
+    Attributes
+    ----------
+    facet : ndarray of int, shape (n,)
+    first : ndarray, shape (n, dim, dim, dim)
+        [patch, i, a, b]: the integral of N_i n_a (x_b - origin_b) dA, m^3 (m^2 in 2D).
+    """
+
+    facet: np.ndarray
+    first: np.ndarray
+
+
+def first_moments(cut: CutCells, patches: np.ndarray, centres: np.ndarray) -> Wet:
+    """Return what a linear pressure on some patches needs; ``centres`` are their cells', from the origin, (n, dim)."""
+    facet = cut.facet[patches]
+    moments = cut.moments[patches] + cut.integrals[patches, :, None] * centres[:, None, :]
+    return Wet(facet, cut.normals[facet][:, None, :, None] * moments[:, :, None, :])
+
+
+@dataclass(frozen=True)
 class Links:
     """How faces of cells next to a surface join unknowns.
 
@@ -107,7 +129,7 @@ def join(
     compact[cells] = np.arange(len(cells), dtype=np.int32)
     compact[n_box:] = len(cells) + np.arange(len(cut.extra_cell), dtype=np.int32)
     axis, face, below, above, alpha, split = _links(cut, cells, compact, shape)
-    slot = _patch_slots(cut, n_box)
+    slot = patch_slots(cut, n_box)
     of = np.ascontiguousarray(compact[slot])
     moment = np.zeros((len(cells) + len(cut.extra_cell), dim, 2))
     area = np.array([np.prod(dx) / d for d in dx])
@@ -129,7 +151,7 @@ def join(
     return Links(axis, face, below, above, openness, split), walls
 
 
-def _patch_slots(cut: CutCells, n_box: int) -> np.ndarray:
+def patch_slots(cut: CutCells, n_box: int) -> np.ndarray:
     """Return the slot of each patch."""
     slot = cut.cell.copy()
     other = np.flatnonzero(cut.piece > 0)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 from mpi4py import MPI
 from numba import njit
 
 from petfsi.fields.mac import kinds
-from petfsi.fields.mac.cut import Links, Walls, join
+from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, join, patch_slots
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.sides import Surroundings
@@ -37,6 +37,8 @@ class Openings:
         None if no rank has any split cell.
     walls : Walls
         Slots are global numbers of unknowns; entries of unknowns that are not solved are left out.
+    wet : Wet
+        About the upper corner of the grid.
     """
 
     cell_kind: np.ndarray
@@ -45,8 +47,9 @@ class Openings:
     volume: np.ndarray
     layout: Layout
     index: np.ndarray
-    extras: Extras | None = None
-    walls: Walls | None = field(default=None, repr=False)
+    extras: Extras | None
+    walls: Walls
+    wet: Wet
 
 
 class CutGrid:
@@ -132,9 +135,18 @@ class CutGrid:
         own[grid.owned(None)] = True
         own = own.reshape(-1)[self._flat]
         solved = own & (cell_kind.reshape(-1)[self._flat] == kinds.FLUID)
-        used = np.flatnonzero(np.concatenate((solved, own[found.extra_cell]))[walls.slot])
+        solved = np.concatenate((solved, own[found.extra_cell]))
+        used = np.flatnonzero(solved[walls.slot])
         walls = Walls(walls.facet[used], walls.axis[used], numbers[used], walls.flux[used])
-        return Openings(cell_kind, face_kind, openness, volume, layout, index, extras, walls)
+        patches = np.flatnonzero(solved[patch_slots(found, len(self._flat))] & (found.facet < len(facets)))
+        wet = first_moments(found, patches, self._centres(found.cell[patches]))
+        return Openings(cell_kind, face_kind, openness, volume, layout, index, extras, walls, wet)
+
+    def _centres(self, cell: np.ndarray) -> np.ndarray:
+        """Return the centres of cells of the box from the upper corner of the grid, (n, dim)."""
+        grid = self.grid
+        index = np.stack(np.unravel_index(cell, self.shape), axis=1) + self.lattice.lo
+        return (index + 0.5) * grid.dx - grid.size
 
     def _without_walls(self, links: Links) -> Links:
         """Drop the links through sides that no pressure acts on: those faces are just as open as they are."""

@@ -16,13 +16,14 @@ from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, evaluate_at, periodic_axes, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
+from petfsi.fields.mac.weight import Weight
 from petfsi.petsc import new_block, set_csr
 from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene
 
 if TYPE_CHECKING:
-    from petfsi.fields.mac.cut import Walls
+    from petfsi.fields.mac.cut import Walls, Wet
     from petfsi.fields.mac.cutgrid import CutGrid, Openings
 
 
@@ -92,6 +93,9 @@ class MacFluid(FluidField):
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
         self._gravity = [Expression(g, ("t",), key="gravity") for g in gravity]
+        # the ray transfer stays as it was published
+        exact = scene.coupling.transfer == "cutcell" and scene.gravity is not None
+        self.weight = Weight(grid, self.density, self._gravity) if exact else None
         self._regions: tuple[int, Regions] | None = None
 
         self.block = new_block(comm, self.layout, self.layout)
@@ -172,8 +176,8 @@ class MacFluid(FluidField):
             self.geometry_version += 1
             self._kinds_changed()
 
-    def cut(self, points: np.ndarray, facets: np.ndarray) -> Walls:
-        """Take over which parts of cells and faces a surface covers; return what it lets through. Collective.
+    def cut(self, points: np.ndarray, facets: np.ndarray) -> tuple[Walls, Wet]:
+        """Take over which parts of cells and faces a surface covers; return what it lets through, and bears. Collective.
 
         Parameters
         ----------
@@ -196,7 +200,7 @@ class MacFluid(FluidField):
             self._kinds_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.geometry_version += 1
-        return found.walls
+        return found.walls, found.wet
 
     def _renumber(self, found: Openings) -> None:
         """Take over the unknowns of split cells; the others keep their place. Collective."""
@@ -262,8 +266,16 @@ class MacFluid(FluidField):
     # ---- the step ---------------------------------------------------------------------------------------------
 
     def unknown(self) -> np.ndarray:
-        """Return the pressure of this rank's cells and of its extra unknowns, Pa, in PETSc's order."""
-        return np.concatenate((self.grid.to_vec(self.pressure), self._extra_pressure))
+        """Return the pressure of this rank's cells and of its extra unknowns, Pa, in PETSc's order.
+
+        Where there is a ``weight``, less that of the fluid at rest.
+        """
+        cells, extra = self.grid.to_vec(self.pressure), self._extra_pressure
+        if self.weight is not None:
+            rest = self.weight.pressure()
+            cells = cells - self.grid.to_vec(np.where(self._active, rest, 0.0))
+            extra = extra if self.extras is None else extra - rest.reshape(-1)[self.extras.cell]
+        return np.concatenate((cells, extra))
 
     def predict(self, time: float, dt: float) -> None:
         """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
@@ -284,6 +296,9 @@ class MacFluid(FluidField):
         buoyancy = 0.0
         if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
             buoyancy = self.scene.fluid.smoke.buoyancy
+        if self.weight is not None:
+            self.weight.at(time)
+            self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
         for axis in self._axes:
             star, kind = self.velocity_star[axis], self.face_kind[axis]
             dv = duration * float(self._gravity[axis](t=time))
@@ -292,7 +307,7 @@ class MacFluid(FluidField):
                 self.boundary_velocity[axis],
                 kind,
                 kinds.STEP[axis],
-                dv,
+                dv if self.weight is None else 0.0,
                 self.pressure if smoke is None else smoke,
                 -buoyancy * dv,
                 self._part(axis),
@@ -367,6 +382,11 @@ class MacFluid(FluidField):
                 self.velocity_star, self._extra_pressure, self.layout.start + n_cells, self.pressure, self.index,
                 factor / (self.density * grid.dx), solved, self.comm,
             )  # fmt: skip
+        if self.weight is not None:
+            rest = self.weight.pressure()
+            self.pressure += np.where(self._active, rest, 0.0)
+            if self.extras is not None:
+                self._extra_pressure += rest.reshape(-1)[self.extras.cell]
         if self.extras is not None or self._other_pressure is not None:
             self._remember_extras()
         self._complete_faces(solved)
