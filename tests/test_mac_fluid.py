@@ -2,7 +2,19 @@
 
 import numpy as np
 import pytest
-from mac_cases import BOX, PERIODIC, make_fluid, max_divergence, reader, set_velocity, solid_box, solve, step, whole, whole_state
+from mac_cases import (
+    BOX,
+    PERIODIC,
+    make_fluid,
+    max_divergence,
+    reader,
+    set_velocity,
+    solid_box,
+    solve,
+    step,
+    whole,
+    whole_state,
+)
 from mpi4py import MPI
 from petsc4py import PETSc
 

@@ -271,7 +271,7 @@ class Obstacle(Table):
 class Coupling(Table):
     """How fluid and solids are joined."""
 
-    transfer: Literal["cutcell", "ray"] = "ray"
+    transfer: Literal["cutcell", "ray"] = "cutcell"
     #: Facets are split until their pieces are about a cell / quadrature.
     quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
 

@@ -85,8 +85,7 @@ class CutGrid:
         self._sides = [self._part(surroundings.side_kind[a], a) for a in range(dim)]
         self._flat = np.arange(int(np.prod(grid.shape(None)))).reshape(grid.shape(None))[self._box].reshape(-1)
         self._flat_faces = [
-            self._part(np.arange(int(np.prod(grid.shape(a)))).reshape(grid.shape(a)), a).reshape(-1)
-            for a in range(dim)
+            self._part(np.arange(int(np.prod(grid.shape(a)))).reshape(grid.shape(a)), a).reshape(-1) for a in range(dim)
         ]
         static = self.cut(np.zeros((0, dim)), np.zeros((0, dim), dtype=np.int64))
         self.covered = static.cell_kind != kinds.FLUID

@@ -10,8 +10,8 @@ from mpi4py import MPI
 from petfsi.errors import InputError
 from petfsi.fields.base import FluidField, Reader, Slab, scalar_slab
 from petfsi.fields.mac import advect, kinds, pressure, views
-from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.extrapolate import FAR, Band
+from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, evaluate_at, periodic_axes, wrapped_points
