@@ -22,22 +22,27 @@ MOST = 32
 
 
 @njit(cache=True)
-def _crossing(p, q, axis, plane, dim, r):
-    """Set r to the point of the segment pq on a plane; the first ``dim`` numbers do not depend on the sense."""
-    swap = False
-    for a in range(dim):
-        if p[a] != q[a]:
-            swap = q[a] < p[a]
+def _crossing(points, i, j, axis, plane, out, m):
+    """Write the point where the line between two points meets a plane; it does not depend on their order."""
+    width = points.shape[1]
+    for a in range(width // 2):
+        if points[i, a] != points[j, a]:
+            if points[j, a] < points[i, a]:
+                i, j = j, i
             break
-    s, e = (q, p) if swap else (p, q)
-    if s[axis] == plane or e[axis] == plane:
-        r[:] = s if s[axis] == plane else e
-        return
-    t = (plane - s[axis]) / (e[axis] - s[axis])
-    for a in range(len(r)):
+    begin, end = points[i, axis], points[j, axis]
+    t = (plane - begin) / (end - begin)
+    if begin == plane or end == plane:
+        t = 0.0
+        i = i if begin == plane else j
+        j = i
+    for a in range(width):
+        p, q = points[i, a], points[j, a]
+        x = p + t * (q - p)
         # never beyond the ends: a part must stay in the slabs it was cut to before
-        r[a] = min(max(s[a] + t * (e[a] - s[a]), min(s[a], e[a])), max(s[a], e[a]))
-    r[axis] = plane
+        low, high = (p, q) if p < q else (q, p)
+        out[m, a] = low if x < low else (high if x > high else x)
+    out[m, axis] = plane
 
 
 @njit(cache=True)
@@ -56,22 +61,22 @@ def clip_polygon(points, tags, n, axis, low, high, out, out_tags):
     tags, out_tags : ndarray of int, shape (MOST,)
     """
     m = 0
-    tag_low, tag_high = PLANE + 2 * axis, PLANE + 2 * axis + 1
     zone = _zone(points[0, axis], low, high)
     for i in range(n):
-        p, q = points[i], points[i + 1 if i + 1 < n else 0]
-        next_zone = _zone(q[axis], low, high)
+        j = i + 1 if i + 1 < n else 0
+        next_zone = _zone(points[j, axis], low, high)
         if zone == 0:
-            out[m] = p
+            for a in range(6):
+                out[m, a] = points[i, a]
             out_tags[m] = tags[i]
             m += 1
         elif next_zone != zone:
-            _crossing(p, q, axis, low if zone < 0 else high, 3, out[m])
+            _crossing(points, i, j, axis, low if zone < 0 else high, out, m)
             out_tags[m] = tags[i]
             m += 1
         if next_zone != 0 and next_zone != zone:
-            _crossing(p, q, axis, low if next_zone < 0 else high, 3, out[m])
-            out_tags[m] = tag_low if next_zone < 0 else tag_high
+            _crossing(points, i, j, axis, low if next_zone < 0 else high, out, m)
+            out_tags[m] = PLANE + 2 * axis + (next_zone > 0)
             m += 1
         zone = next_zone
     return m
@@ -94,7 +99,7 @@ def clip_segment(points, tags, axis, low, high, out, out_tags):
         if zones[i] == 0:
             out[i], out_tags[i] = points[i], tags[i]
         else:
-            _crossing(points[0], points[1], axis, low if zones[i] < 0 else high, 2, out[i])
+            _crossing(points, 0, 1, axis, low if zones[i] < 0 else high, out, i)
             out_tags[i] = PLANE + 2 * axis + (zones[i] > 0)
     return 2
 
@@ -117,9 +122,9 @@ def load_facet(x, corners, points, tags):
     """Write a facet's corners, their weights and tags."""
     dim = len(corners)
     for i in range(dim):
-        points[i, :dim] = x[corners[i]]
-        points[i, dim:] = 0.0
-        points[i, dim + i] = 1.0
+        for a in range(dim):
+            points[i, a] = x[corners[i], a]
+            points[i, dim + a] = 1.0 if a == i else 0.0
         tags[i] = i
 
 
