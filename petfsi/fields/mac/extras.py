@@ -59,7 +59,7 @@ class Extras:
         Parameters
         ----------
         pattern, values : Pattern, ndarray
-            Rows of the cells, in the grid's own numbers.
+            Rows of the cells, in the grid's own numbers; values may be changed.
         layout, index : Layout, ndarray
             The unknowns, and their numbers by local cell.
         grid : MacGrid
@@ -77,6 +77,12 @@ class Extras:
         order = np.argsort(old, kind="stable")
         columns = index.reshape(-1)[cells[order]][np.searchsorted(old[order], pattern.indices)]
         n_cells, n_rows = grid.layout.n_local, layout.n_local
+        pocket = POCKET_DIAGONAL * 2.0 * c.sum()
+        linked = np.unique(np.concatenate((self.below, self.above))) - layout.start
+        linked = linked[(linked >= 0) & (linked < n_rows)]
+        # a cell that the grid's own faces leave alone is no pocket if it has links
+        own = pattern.slot[linked[linked < n_cells], 0]
+        values[own] = np.where(values[own] == pocket, 0.0, values[own])
         indptr = np.concatenate((pattern.indptr, np.full(n_rows - n_cells, pattern.indptr[-1])))
         shape = (n_rows, layout.n_global)
         rows = csr_matrix((values, columns, indptr), shape=shape)
@@ -92,10 +98,10 @@ class Extras:
             i.append(one[mine] - layout.start)
             j.append(other[mine])
             v.append(-weight[mine])
-        extra = np.arange(n_cells, n_rows)
-        i.append(extra)
-        j.append(extra + layout.start)
-        v.append(np.full(len(extra), POCKET_DIAGONAL * 2.0 * c.sum()))
+        alone = np.setdiff1d(np.arange(n_cells, n_rows), linked)
+        i.append(alone)
+        j.append(alone + layout.start)
+        v.append(np.full(len(alone), pocket))
         added = coo_matrix((np.concatenate(v), (np.concatenate(i), np.concatenate(j))), shape=shape)
         total = (rows + added.tocsr()).tocsr()
         total.sort_indices()
