@@ -13,7 +13,10 @@ from petfsi.scene.schema import Scene
 #: Where each kind of field and coupling lives; a new one is its file and a line here.
 FLUIDS = {"mac": "petfsi.fields.mac.fluid:MacFluid"}
 SOLIDS = {"simplex": "petfsi.fields.solid.solid:SimplexSolid"}
-COUPLINGS = {"ray": "petfsi.couplings.ray:RayCoupling"}
+COUPLINGS = {
+    "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
+    "ray": "petfsi.couplings.ray:RayCoupling",
+}
 
 
 def _class(place: str) -> type:

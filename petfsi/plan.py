@@ -131,6 +131,7 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
         return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
     from petfsi.geometry.bodies import build_bodies
     from petfsi.geometry.meshes import read_surface
+    from petfsi.geometry.obstacles import obstacle_surfaces
 
     errors, meshes = [], {}
     readers: list[Callable[[], object]] = [
@@ -138,6 +139,8 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
         for name, obstacle in scene.obstacles.items()
         if obstacle.shape.mesh is not None
     ]
+    if scene.obstacles and scene.coupling.transfer == "cutcell":
+        readers = [partial(obstacle_surfaces, scene)]
     for read in [lambda: meshes.update(build_bodies(scene)), *readers]:
         try:
             read()
@@ -149,10 +152,13 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
 
 
 def _plain_cells(solid: Solid) -> list[int] | None:
-    """Return the cells of a box about which nothing can be wrong that the scene alone does not show."""
+    """Return the cells per axis of a box or ball about which only what the scene alone shows can be wrong."""
     shape = solid.shape
-    named = all(isinstance(support.where, str) for support in solid.supports)
-    return shape.box.cells if shape.box is not None and shape.cavity is None and named else None
+    if shape.cavity is not None or any(not isinstance(support.where, str) for support in solid.supports):
+        return None
+    if shape.ball is not None and shape.ball.cells is not None:
+        return [shape.ball.cells] * len(shape.ball.centre)
+    return shape.box.cells if shape.box is not None else None
 
 
 def _state_bytes(scene: Scene, nodes: int, cells: int) -> float:

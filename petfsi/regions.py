@@ -35,6 +35,10 @@ class ClosedRegions:
         self._volumes = np.zeros(0)
         self._found_for: tuple[int, ...] | None = None
 
+    def adopt(self, system: System) -> None:
+        """Speak to another system of the same fields from now on."""
+        self.system, self._found_for = system, None
+
     def refresh(self) -> None:
         """Find the regions and hand their null vectors to PETSc, if the geometry changed. Collective."""
         fluid, system = self.fluid, self.system
@@ -45,8 +49,8 @@ class ClosedRegions:
         touched = next((coupling.touched for coupling in system.couplings), None)
         regions = fluid.closed_regions(touched)
         self._members = [member for member, _ in regions]
-        counts = system.comm.allreduce(np.array([member.sum() for member in self._members]))
-        self._volumes = counts * fluid.cell_volume
+        volumes = fluid.volumes()
+        self._volumes = system.comm.allreduce(np.array([member @ volumes for member in self._members]))
         rigid = [member for member, touches_solid in regions if not touches_solid]
         _attach(fluid.block, self._members if self.decoupled else rigid)
         if system.index_sets:

@@ -178,6 +178,11 @@ class Solver:
             self._ksp.destroy()
             self._ksp = None
 
+    def adopt(self, system: System) -> None:
+        """Solve another system of the same fields from now on. Collective."""
+        self.reset()
+        self.system, self._monolith = system, None
+
     def solve(self, changed: bool) -> Outcome:
         """Solve for the system's solution, from its first guess. Collective.
 

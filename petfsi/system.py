@@ -55,11 +55,22 @@ class System:
         offsets = np.cumsum([0] + [field.layout.n_local for field in self.fields])
         self._pieces = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
         self._seen: dict[object, int] = {}
+        self._held = self._blocks()
 
     @property
     def unknowns(self) -> dict[str, int]:
         """Unknowns of each field."""
         return {field.name: field.layout.n_global for field in self.fields}
+
+    def is_outdated(self) -> bool:
+        """Return whether a field or coupling has put another matrix in the place of one that the operator holds."""
+        return self._blocks() != self._held
+
+    def _blocks(self) -> list[int]:
+        """Return the handles of all blocks."""
+        blocks = [field.block for field in self.fields]
+        blocks += [block for coupling in self.couplings for block in coupling.blocks.values()]
+        return [block.handle for block in blocks]
 
     def refresh(self) -> bool:
         """Scale what was assembled anew, fill right-hand side and first guess; say whether the operator changed.

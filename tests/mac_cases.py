@@ -99,3 +99,15 @@ def solid_box(fluid, low, high):
     for line, a, b in zip(x, low, high, strict=True):
         covered &= (line > a) & (line < b)
     return covered.astype(np.uint8)
+
+
+def max_divergence(fluid):
+    """Return the largest net outflow of a solved cell over the area of a (cubic) cell's face, m/s. Collective."""
+    grid = fluid.grid
+    part = grid.owned(None)
+    total = np.zeros(grid.owned_shape)
+    for axis in range(fluid.dim):
+        above = tuple(slice(s.start + (b == axis), s.stop + (b == axis)) for b, s in enumerate(part))
+        total += grid.face_area(axis) * (fluid.velocity[axis][above] - fluid.velocity[axis][part])
+    most = np.abs(total[fluid.cell_kind[part] == 0]).max(initial=0.0)
+    return grid.comm.allreduce(most, MPI.MAX) / grid.cell_volume ** ((fluid.dim - 1) / fluid.dim)

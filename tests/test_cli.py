@@ -1,6 +1,7 @@
 import io
 import subprocess
 import sys
+import tomllib
 import types
 from pathlib import Path
 
@@ -34,6 +35,9 @@ poisson = 0.3
 [output]
 every = 0.3
 """
+
+
+JOBS = Path(__file__).parents[1] / "jobs"
 
 
 @pytest.fixture
@@ -248,8 +252,6 @@ def test_a_broken_scene_is_reported_once_under_mpirun(scene):
 
 
 def plan_scene(**changes):
-    import tomllib
-
     return scene_from_dict(tomllib.loads(SCENE) | changes)
 
 
@@ -280,6 +282,43 @@ def test_the_plan_counts_the_nodes_of_meshes_as_they_are_built(tmp_path):
     wet = {**plan_scene().model_dump(exclude={"fluid", "solids"}), "solids": {"a": solid}, "fluid": fluid}
     with pytest.raises(InputError, match="solids.a.shape = .*y must lie inside the fluid's grid"):
         describe_plan(scene_from_dict(wet, tmp_path))
+
+
+@pytest.mark.parametrize("job", sorted(JOBS.glob("*.toml")), ids=lambda path: path.stem)
+def test_a_shipped_scene_passes_its_check(job):
+    done = petfsi("check", job)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "setting, said",
+    [
+        ("solids.disk.shape.ball.cells=7", "solids.disk.shape.ball.cells = 7: must be a multiple of 2"),
+        ("solids.disk.shape.ball.radius=1.05", "solids.disk.shape: overlaps obstacles.container with"),
+        ("obstacles.container.shape.ball.cells=8", "obstacles.container.shape.ball.cells = 8: only a solid's ball"),
+        ("coupling.transfer=rays", "coupling.transfer = \"rays\": must be 'cutcell' or 'ray'"),
+    ],
+)
+def test_a_mistake_in_a_round_shape_is_named_with_exit_code_2(setting, said):
+    done = petfsi("check", JOBS / "added-mass-disk.toml", "--set", setting)
+    assert done.returncode == 2 and said in done.stderr
+
+
+def test_the_plan_counts_the_nodes_of_a_ball():
+    shape = {"ball": {"centre": [0.5, 0.5], "radius": 0.25, "cells": 6}}
+    solid = {"shape": shape, "density": 1200.0, "young": 1.0e5, "poisson": 0.3}
+    assert "98 unknowns (b 49 nodes, 72 cells)" in describe_plan(plan_scene(solids={"b": solid}))
+
+
+@pytest.mark.parametrize("transfer", ["ray", "cutcell"])
+def test_the_check_reads_the_surfaces_of_obstacles(tmp_path, transfer):
+    (tmp_path / "bad.stl").write_text("no mesh")
+    obstacles = {"hull": {"shape": {"mesh": "bad.stl"}}}
+    data = tomllib.loads(SCENE) | {"obstacles": obstacles, "coupling": {"transfer": transfer}}
+    with pytest.raises(InputError) as error:
+        describe_plan(scene_from_dict(data, tmp_path))
+    (line,) = str(error.value).splitlines()
+    assert line.startswith("obstacles.hull.shape.mesh = ") and "cannot be read as a mesh" in line
 
 
 def test_what_is_skipped_has_a_reason():

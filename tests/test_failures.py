@@ -157,7 +157,7 @@ SCENES = {
     "support": (replaced('where = "bottom"', 'where = "botom"'), ['supports.0.where = "botom"', "bottom"]),
     "axis": (replaced('fix = ["x", "y"]', 'fix = ["x", "w"]'), ['supports.0.fix.1 = "w"', "'x', 'y' or 'z'"]),
     "two shapes": (replaced(BLOCK, BLOCK[:-1] + ', mesh = "a.msh" }'), ["exactly one of box, ball"]),
-    "a ball": (replaced(BLOCK, "{ ball = { centre = [1, 1], radius = 0.2 } }"), ["a solid must be meshed"]),
+    "a ball": (replaced(BLOCK, "{ ball = { centre = [1, 1], radius = 0.2 } }"), ["shape.ball.cells: is missing"]),
     "outside the grid": (
         replaced("origin = [1.0, 0.0]", "origin = [2.8, 0.0]"),
         ['solids.block.shape.box = "x from 2.8 to 3.3 m"', "x must lie inside the fluid's grid, 0 to 3 m"],

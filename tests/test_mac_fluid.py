@@ -2,7 +2,19 @@
 
 import numpy as np
 import pytest
-from mac_cases import BOX, PERIODIC, make_fluid, reader, set_velocity, solid_box, solve, step, whole, whole_state
+from mac_cases import (
+    BOX,
+    PERIODIC,
+    make_fluid,
+    max_divergence,
+    reader,
+    set_velocity,
+    solid_box,
+    solve,
+    step,
+    whole,
+    whole_state,
+)
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -108,10 +120,10 @@ def test_the_projection_leaves_no_divergence(cells):
         obstacles={"ball": {"shape": {"ball": {"centre": [0.6, 0.4, 0.5][: len(cells)], "radius": 0.2}}}},
         initial={"velocity": ["cos(9*y)", "sin(7*x)", "x*y"][: len(cells)]},
     )
-    assert fluid.max_divergence() > 0.1
+    assert max_divergence(fluid) > 0.1
     for number in range(2):
         step(fluid, 0.02 * number, 0.02)
-        assert fluid.max_divergence() < 1e-12
+        assert max_divergence(fluid) < 1e-12
     assert fluid.is_finite()
 
 
@@ -136,7 +148,7 @@ def test_a_taylor_green_vortex_decays_and_keeps_its_shape():
     n = 32
     velocity = ["sin(2*pi*x)*cos(2*pi*y)", "-cos(2*pi*x)*sin(2*pi*y)"]
     fluid = make_fluid((n, n), sides=PERIODIC, initial={"velocity": velocity})
-    assert fluid.max_divergence() < 1e-12
+    assert max_divergence(fluid) < 1e-12
     energy = [fluid.kinetic_energy()]
     assert energy[0] == pytest.approx(1000.0 * 0.25, rel=1e-12)
     first = [v.copy() for v in fluid.velocity]

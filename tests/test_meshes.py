@@ -124,11 +124,6 @@ def test_a_cavity_that_takes_everything_is_refused():
         build_mesh(box(2, cavity={"origin": [0, 0], "size": [9, 9]}), 2, "solids.b", ".")
 
 
-def test_a_solid_without_cells_is_refused():
-    with pytest.raises(InputError, match=r"solids\.b\.shape: a solid wants a box with cells"):
-        build_mesh(solid(ball={"centre": [0, 0], "radius": 1}), 2, "solids.b", ".")
-
-
 def test_a_union_keeps_bodies_apart():
     mesh = SimplexMesh.union([(SQUARE, TWO_TRIANGLES), (SQUARE, TWO_TRIANGLES[:1])])
     assert mesh.body.tolist() == [0, 0, 1]

@@ -73,7 +73,7 @@ def make_scene(cells, size, solids=None, **extra):
 
 
 def couple(comm, cells, size, points, facets, quadrature=2, sides=None, **shell):
-    scene = make_scene(cells, size, sides=sides or {}, coupling={"quadrature": quadrature})
+    scene = make_scene(cells, size, sides=sides or {}, coupling={"transfer": "ray", "quadrature": quadrature})
     fluid, solid = MacFluid(comm, scene), Shell(comm, points, facets, **shell)
     coupling = RayCoupling(fluid, solid, scene.coupling)
     step(coupling)
@@ -329,7 +329,7 @@ def test_touched_cells_are_those_with_a_row(dim):
     random = np.random.default_rng(0).normal(size=points.shape)
     rows = outflow(it, random) != 0
     it.grid.exchange_cells(rows)
-    assert np.array_equal(it.coupling.touched, rows)
+    assert np.array_equal(it.coupling.touched_cells, rows)
     x = np.broadcast_to(it.grid.coordinates(None)[0], rows.shape)
     assert not rows[x > 0.62].any()
 
@@ -434,7 +434,8 @@ def test_any_number_of_ranks_gives_the_serial_answer(dim, sides):
     assert np.allclose(flux[mine], serial_flux[theirs], rtol=0, atol=1e-15)
     mine, theirs = piece(None)
     assert np.array_equal(it.fluid.cell_kind[mine], serial.fluid.cell_kind[theirs])
-    assert np.array_equal(it.coupling.touched[mine], serial.coupling.touched[theirs])
+    touched, serial_touched = it.coupling.touched_cells, serial.coupling.touched_cells
+    assert np.array_equal(touched[mine], serial_touched[theirs])
     for a in range(dim):
         mine, theirs = piece(a)
         assert np.array_equal(it.fluid.face_kind[a][mine], serial.fluid.face_kind[a][theirs])
@@ -531,7 +532,7 @@ def test_a_block_of_elements_under_water(dim):
     solid = {"shape": {"box": box}, "density": 1200.0, "young": 1e5, "poisson": 0.3}
     solid["supports"] = [{"where": "bottom", "fix": ["x", "y"]}]
     solid["initial"] = {"velocity": ["0.1*y", "0.2"] + ["0.0"] * (dim - 2)}
-    scene = make_scene([20] * dim, [1.0] * dim, solids={"block": solid})
+    scene = make_scene([20] * dim, [1.0] * dim, solids={"block": solid}, coupling={"transfer": "ray"})
     fluid, field = MacFluid(MPI.COMM_WORLD, scene), SimplexSolid(MPI.COMM_WORLD, scene)
     coupling = RayCoupling(fluid, field, scene.coupling)
     step(coupling)

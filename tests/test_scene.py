@@ -129,6 +129,15 @@ def without(data: dict, *keys: str) -> dict:
 
 BOX = "{ origin = [0.0, 0.0], size = [1.0, 1.0] }"
 
+#: A disk that reaches 5 cm into the layer.
+STONE = "{shape = {ball = {centre = [0.5, 0.55], radius = 0.1, cells = 4}}, density = 1.0, young = 1.0, poisson = 0.0}"
+
+
+def ball(settings: str) -> str:
+    """Return the setting that makes the layer a disk."""
+    return f"solids.layer.shape={{ball = {{{settings}}}}}"
+
+
 #: Settings laid over a sound scene, the key that is wrong then, and words of what is allowed.
 BROKEN = [
     # one value at a time
@@ -173,6 +182,7 @@ BROKEN = [
     (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'displacement', 'velocity', 'pressure' or"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
     (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
+    (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell' or 'ray'"),
     (["coupling.quadrature=9"], "coupling.quadrature = 9", "must be 4 or less"),
     (["title=3"], "title = 3", "must be a text in quotes"),
     (["gravity.0=true"], "gravity.0 = true", "must be a number or an expression in quotes (m/s^2"),
@@ -211,7 +221,34 @@ BROKEN = [
     (["solids.layer.shape={}"], "solids.layer.shape", "must have exactly one of box, ball, cylinder"),
     (["solids.layer.shape.mesh='a.msh'"], 'solids.layer.shape = "box, mesh"', "must have exactly one of"),
     ([f"solids.layer.shape.box={BOX}"], "solids.layer.shape.box.cells", "is missing; a solid's box needs"),
-    (["solids.layer.shape={ball = {centre = [0.5, 0.5], radius = 0.1}}"], "shape.ball", "a solid must be meshed"),
+    (["solids.layer.shape={halfspace = {point = [0.0, 0.0], normal = [0.0, 1.0]}}"], "halfspace", "must be meshed"),
+    ([ball("centre = [0.5, 0.5], radius = 0.1")], "layer.shape.ball.cells", "is missing; a solid's ball needs its"),
+    ([ball("centre = [0.5, 0.5], radius = 0.1, cells = 7")], "shape.ball.cells = 7", "a multiple of 2 (cells across)"),
+    ([ball("centre = [0.5, 0.5], radius = 0.1, cells = 0")], "shape.ball.cells = 0", "must be 2 or more"),
+    (
+        [ball("centre = [0.5, 0.5], radius = 0.1, cells = [8, 8]")],
+        "shape.ball.cells = [8, 8]",
+        "must be a whole number",
+    ),
+    ([ball("centre = [0.5, 0.5], radius = 0.1, cells = 50000")], "ball.cells = 50000", "make more than 2147483647"),
+    ([ball("centre = [0.5, 0.5], radius = 0.0, cells = 8")], "shape.ball.radius = 0.0", "must be greater than 0"),
+    ([ball("centre = [0.5], radius = 0.1, cells = 8")], "shape.ball.centre = [0.5]", "must have 2 items"),
+    (
+        [ball("centre = [0.9, 0.5], radius = 0.2, cells = 8")],
+        'shape.ball = "x from 0.7 to 1.1 m"',
+        "inside the fluid's",
+    ),
+    (
+        [ball("centre = [0.5, 0.5], radius = 0.1, cells = 8"), f"solids.layer.shape.cavity={BOX}"],
+        "solids.layer.shape.cavity",
+        "belongs to a meshed box only",
+    ),
+    ([f"solids.two={STONE}"], "solids.two.shape.ball", "overlaps solids.layer; bodies must lie apart"),
+    (
+        [f"solids.two={STONE}", ball("centre = [0.5, 0.8], radius = 0.21, cells = 8")],
+        "solids.two.shape.ball",
+        "overlaps solids.layer; bodies must lie apart",
+    ),
     (["solids.layer.shape={mesh='missing.msh'}"], "solids.layer.shape.mesh", "no such file"),
     (["solids.layer.shape.scale=2.0"], "solids.layer.shape.scale = 2.0", "belongs to a mesh file only"),
     (["solids.layer.shape.translate=[0.0, 0.0]"], "solids.layer.shape.translate", "belongs to a mesh file only"),
@@ -238,6 +275,21 @@ BROKEN = [
         ["obstacles.floor.shape={box = {origin = [0.0, 0.0], size = [1.0, 1.0], cells = [2, 2]}}"],
         "obstacles.floor.shape.box.cells = [2, 2]",
         "only a solid's box is meshed",
+    ),
+    (
+        ["obstacles.floor.shape={ball = {centre = [0.0, 0.0], radius = 0.1, cells = 8}}"],
+        "obstacles.floor.shape.ball.cells = 8",
+        "only a solid's ball is meshed; leave cells out",
+    ),
+    (
+        ["fluid.sides.right.inflow.region.ball.cells=8"],
+        "fluid.sides.right.inflow.region.ball.cells = 8",
+        "only a solid's ball is meshed",
+    ),
+    (
+        ["fluid.sides.bottom=periodic", "fluid.sides.top=periodic"],
+        "obstacles.floor.shape.halfspace.normal = [0.0, 1.0]",
+        "must not lean along y, whose sides are periodic",
     ),
     ([f"obstacles.floor.shape.cavity={BOX}"], "obstacles.floor.shape.cavity", "only a solid's box can have a cavity"),
     (["obstacles.floor.shape={mesh='missing.stl'}"], "obstacles.floor.shape.mesh", "no such file"),
@@ -278,6 +330,21 @@ def test_a_mistake_is_reported_once_with_its_key_its_value_and_what_is_allowed(s
     lines = mistakes(layer(*sets))
     assert len(lines) == 1, lines
     assert key in lines[0] and allowed in lines[0], lines[0]
+
+
+@pytest.mark.parametrize("lower", [0.6, 0.61])
+def test_a_ball_may_lie_on_another_body(lower):
+    stone = STONE.replace("0.55", str(lower))
+    assert "two" in scene_from_dict(layer(f"solids.two={stone}")).solids
+    disks = layer(f"solids.two={stone}", ball(f"centre = [0.5, {lower - 0.2}], radius = 0.1, cells = 4"))
+    assert "two" in scene_from_dict(disks).solids
+
+
+def test_a_half_space_may_stand_beside_periodic_sides():
+    data = layer("fluid.sides.left=periodic", "fluid.sides.right=periodic")
+    assert scene_from_dict(data).obstacles["floor"].shape.halfspace is not None
+    lines = mistakes({**data, "obstacles": {"floor": {"shape": {"halfspace": {"point": [0, 0], "normal": [0.1, 1]}}}}})
+    assert len(lines) == 1 and "must not lean along x, whose sides are periodic" in lines[0]
 
 
 @pytest.mark.parametrize(
@@ -354,6 +421,7 @@ def test_all_mistakes_stand_together_whatever_finds_them():
         ["solids.layer.shape.box.origin=[0.5, true]"],
         ["probes.top.of=3"],
         ["solids.layer.supports.0.fix=['q']"],
+        [ball("centre = [0.5, 0.5], radius = 0.1, cells = true")],
         ["dim=5"],
     ],
 )

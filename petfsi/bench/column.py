@@ -84,6 +84,7 @@ class Column:
             "fluid.density": FLUID_DENSITY,
             "fluid.size": [width, self.height],
             "fluid.cells": [self.wide, self.cells],
+            "coupling.transfer": "ray",
             "fluid.initial.velocity": [0.0, SPEED * float(np.sin(x))],
             "solids.layer.shape.box.size": [width, SOLID_HEIGHT],
             "solids.layer.shape.box.cells": [max(1, self.wide // 2), self.cells // 8],

@@ -126,6 +126,7 @@ class Layer:
             "fluid.density": FLUID_DENSITY,
             "fluid.size": [width, height],
             "fluid.cells": [1, self.cells],
+            "coupling.transfer": "ray",
             "fluid.initial.velocity": [0.0, SPEED],
             "solids.layer.shape": shape,
             "solids.layer.density": self.density,

@@ -19,7 +19,7 @@ class Coupling(ABC):
     pattern_version : int
         Grows whenever the pattern of a block changes; the same on all ranks.
     touched : ndarray of bool or None
-        The fluid's cells that the coupling acts on, in the fluid's own arrangement; None is none.
+        This rank's unknowns of the fluid that the coupling acts on; None is none.
     n_coupled, n_assembled : int
         How often the transfer operators were made and the blocks filled; a step that changes nothing adds nothing.
     """

@@ -39,7 +39,7 @@ class RayCoupling(Coupling):
 
     Attributes
     ----------
-    touched : ndarray of bool
+    touched_cells : ndarray of bool
         Cell array: fluid cells whose row of D1 H is not zero (valid in ghosts).
 
     References
@@ -64,7 +64,7 @@ class RayCoupling(Coupling):
             (fluid.name, solid.name): self.flux_block,
             (solid.name, fluid.name): self.force_block,
         }
-        self.touched: np.ndarray = self.grid.zeros_cells(dtype=bool)
+        self.touched_cells: np.ndarray = self.grid.zeros_cells(dtype=bool)
         self._positions: np.ndarray | None = None
         self._faces: list[rays.Hits] = []
         self._rows: list[Rows] = []
@@ -83,6 +83,7 @@ class RayCoupling(Coupling):
         hits = self._immerse(positions, shifts)
         self._faces = [self._solid_faces(a, hits[a], positions, shifts) for a in range(self.dim)]
         self._point_flux = self._point_fluxes()
+        self.touched = self.grid.to_vec(self.touched_cells)
         self._rows = [self._flux_rows(), self._force_rows(positions)]
         self._stale = True
         self.n_coupled += 1
@@ -171,7 +172,7 @@ class RayCoupling(Coupling):
         owned = np.zeros(kind.shape, dtype=bool)
         owned[grid.owned(None)] = True
         free = np.diff(self._free_map.indptr) > 0
-        self.touched[...] = False
+        self.touched_cells[...] = False
         rows, cols, values = [], [], []
         for a, faces in enumerate(self._faces):
             points = self.surface.facets[faces.facet] * self.dim + a
@@ -182,7 +183,7 @@ class RayCoupling(Coupling):
             for cell, sign in ((above, -1.0), (below, 1.0)):
                 local = np.flatnonzero((cell[a] >= 0) & (cell[a] < kind.shape[a]))
                 local = local[kind[tuple(cell[:, local])] == FLUID]
-                self.touched[tuple(cell[:, local[moves[local]]])] = True
+                self.touched_cells[tuple(cell[:, local[moves[local]]])] = True
                 mine = local[owned[tuple(cell[:, local])]]
                 rows.append(np.repeat(grid.index[tuple(cell[:, mine])] - layout.start, self.dim))
                 cols.append(points[mine].reshape(-1))

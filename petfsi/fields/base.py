@@ -122,14 +122,14 @@ class FluidField(Field):
 
     @abstractmethod
     def closed_regions(self, touched: np.ndarray | None) -> list[tuple[np.ndarray, bool]]:
-        """Return each connected region without an open face, and whether it has any of the ``touched`` cells.
+        """Return each connected region without an open face, and whether it has any of the ``touched`` unknowns.
 
-        A region is given by 1 on its cells and 0 elsewhere, this rank's part of a pressure vector. Collective.
+        A region is given by 1 on its unknowns and 0 elsewhere, this rank's part of a pressure vector. Collective.
         """
 
     @abstractmethod
-    def max_divergence(self) -> float:
-        """Return the largest net outflow of a cell per face area, m/s. Collective."""
+    def volumes(self) -> np.ndarray:
+        """Return the volume of fluid that belongs to each of this rank's unknowns, m^3 (m^2 in 2D)."""
 
     @abstractmethod
     def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:

@@ -1,4 +1,4 @@
-"""Simplex meshes: structured boxes, files, and the checks that both must pass."""
+"""Simplex meshes: structured boxes and balls, files, and the checks that they must pass."""
 
 from __future__ import annotations
 
@@ -9,20 +9,16 @@ import math
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from petfsi.errors import InputError
+from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.scene.schema import Box, Shape, Solid
 
-if TYPE_CHECKING:  # meshes can be checked without starting MPI
-    pass
-
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 #: A cell is degenerate below this fraction of its longest edge to the power dim.
@@ -68,7 +64,7 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
     Parameters
     ----------
     solid : Solid
-        The table; its shape is a box with cells, or a mesh file.
+        The table; its shape is a box or a ball with cells, or a mesh file.
     dim : int
         2 for triangles, 3 for tetrahedra.
     key : str
@@ -87,8 +83,10 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
         points, cells = read_mesh(shape, dim, key, directory)
         _check(points, cells, f"{key} = {shape.mesh!r}")
         return points, cells
+    if shape.ball is not None and shape.ball.cells is not None:
+        return ball_mesh(shape.ball, dim)
     if shape.box is None or shape.box.cells is None:
-        raise InputError(f"{key}.shape: a solid wants a box with cells, or a mesh file")
+        raise InputError(f"{key}.shape: a solid wants a box or a ball with cells, or a mesh file")
     points, cells = box_mesh(shape.box)
     if shape.cavity is not None:
         centre = points[cells].reshape(-1, math.factorial(dim), dim + 1, dim).mean(axis=(1, 2))

@@ -5,7 +5,6 @@ The schema has judged each value by itself by now, so types and signs are right 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
@@ -15,22 +14,28 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Box, Fluid, InflowSide, Probe, Scene, Shape, Solid
+from petfsi.scene.schema import Fluid, Halfspace, InflowSide, Probe, Scene, Shape, Solid
+from petfsi.scene.shape_checks import (
+    SLACK,
+    Problems,
+    analytic_shape,
+    extent,
+    is_measured,
+    length,
+    overlap,
+    plain_shape,
+    sizes,
+    solid_shape,
+)
 from petfsi.scene.stepping import Stepping
 
 MAX_STEPS = 10**8
-#: PETSc numbers unknowns with 32 bits.
-MAX_CELLS = 2**31 - 1
-#: Bodies may touch the grid's sides and each other; this fraction of a length is round-off.
-SLACK = 1e-9
 
 OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
 SOLID_QUANTITIES = ("displacement", "velocity")
 NO_Z = "bounds z, which dim = 2 does not have"
 #: Columns of history.csv, which a scalar probe must not repeat.
 RESERVED_PROBES = ("step", "time", "dt", "iterations", "residual", "volume_error", "divergence")
-
-Problems = Iterator[Problem]
 
 
 def problems(scene: Scene) -> list[Problem]:
@@ -86,29 +91,6 @@ def _time(scene: Scene) -> Problems:
         yield Problem("time.dt", time.dt, allowed, ("time.end",))
 
 
-# ---- lengths ------------------------------------------------------------------------------------------------
-
-
-def _length(key: str, value: Sequence | None, dim: int) -> Problems:
-    if value is not None and len(value) != dim:
-        yield Problem(key, value, f"must have {dim} items, as dim = {dim}", ("dim",))
-
-
-def _box(key: str, box: Box | Fluid, dim: int) -> Problems:
-    yield from _length(f"{key}.origin", box.origin, dim)
-    yield from _length(f"{key}.size", box.size, dim)
-    yield from _length(f"{key}.cells", box.cells, dim)
-    if min(box.size, default=1.0) <= 0:
-        yield Problem(f"{key}.size", box.size, "must be greater than 0 along every axis (m)")
-    if box.cells is not None and math.prod(box.cells) > MAX_CELLS:
-        yield Problem(f"{key}.cells", box.cells, f"make more than {MAX_CELLS} cells, the most that can be numbered")
-
-
-def _is_measured(box: Box | Fluid, dim: int) -> bool:
-    """Whether a box is sound enough to compare places with it."""
-    return len(box.origin) == len(box.size) == dim and min(box.size) > 0
-
-
 # ---- fluid --------------------------------------------------------------------------------------------------
 
 
@@ -116,8 +98,8 @@ def _fluid(scene: Scene) -> Problems:
     fluid = scene.fluid
     if fluid is None:
         return
-    yield from _box("fluid", fluid, scene.dim)
-    yield from _length("fluid.initial.velocity", fluid.initial.velocity, scene.dim)
+    yield from sizes("fluid", fluid, scene.dim)
+    yield from length("fluid.initial.velocity", fluid.initial.velocity, scene.dim)
     if fluid.smoke is not None and fluid.smoke.buoyancy != 0 and scene.gravity is None:
         allowed = "buoyancy is a multiple of gravity; set gravity too, or buoyancy to 0"
         yield Problem("fluid.smoke.buoyancy", fluid.smoke.buoyancy, allowed, ("gravity",))
@@ -143,7 +125,7 @@ def _sides(scene: Scene) -> Problems:
     for side, inflow in inflows:
         key = f"fluid.sides.{side}.inflow"
         if inflow.region is not None:
-            yield from _analytic_shape(f"{key}.region", inflow.region, scene.dim)
+            yield from analytic_shape(f"{key}.region", inflow.region, scene.dim)
         if inflow.smoke > 0 and scene.fluid.smoke is None:
             allowed = "smoke needs a table [fluid.smoke] (it may be empty)"
             yield Problem(f"{key}.smoke", inflow.smoke, allowed, ("fluid.smoke",))
@@ -153,95 +135,7 @@ def _sides(scene: Scene) -> Problems:
         yield Problem(f"fluid.sides.{inflows[0][0]}.inflow", ABSENT, allowed, ("fluid.sides", "solids"))
 
 
-# ---- shapes -------------------------------------------------------------------------------------------------
-
-
-def _shape(key: str, shape: Shape, dim: int) -> Problems:
-    """Judge what any shape must keep, wherever it stands."""
-    kinds = shape.kinds
-    if len(kinds) != 1:
-        found = ", ".join(kinds) or ABSENT
-        yield Problem(key, found, "must have exactly one of box, ball, cylinder, halfspace, mesh")
-    if shape.box is not None:
-        yield from _box(f"{key}.box", shape.box, dim)
-    if shape.ball is not None:
-        yield from _length(f"{key}.ball.centre", shape.ball.centre, dim)
-    if shape.cylinder is not None:
-        yield from _cylinder(f"{key}.cylinder", shape, dim)
-    if shape.halfspace is not None:
-        yield from _length(f"{key}.halfspace.point", shape.halfspace.point, dim)
-        yield from _length(f"{key}.halfspace.normal", shape.halfspace.normal, dim)
-        if not any(shape.halfspace.normal):
-            yield Problem(f"{key}.halfspace.normal", shape.halfspace.normal, "must not be zero")
-    yield from _length(f"{key}.translate", shape.translate, dim)
-    for name in ("scale", "translate"):
-        if shape.mesh is None and name in shape.model_fields_set and getattr(shape, name) not in (1.0, None):
-            yield Problem(f"{key}.{name}", getattr(shape, name), "belongs to a mesh file only", (f"{key}.mesh",))
-
-
-def _cylinder(key: str, shape: Shape, dim: int) -> Problems:
-    cylinder = shape.cylinder
-    assert cylinder is not None
-    if dim == 2:
-        yield Problem(key, ABSENT, "a cylinder needs dim = 3; in 2D use ball, a disk", ("dim",))
-        return
-    yield from _length(f"{key}.start", cylinder.start, dim)
-    yield from _length(f"{key}.end", cylinder.end, dim)
-    if cylinder.start == cylinder.end:
-        yield Problem(f"{key}.end", cylinder.end, "must differ from start")
-
-
-def _plain_shape(key: str, shape: Shape, dim: int) -> Problems:
-    """Judge a shape that is never meshed."""
-    yield from _shape(key, shape, dim)
-    if shape.box is not None and shape.box.cells is not None:
-        yield Problem(f"{key}.box.cells", shape.box.cells, "only a solid's box is meshed; leave cells out")
-    if shape.cavity is not None:
-        yield Problem(f"{key}.cavity", ABSENT, "only a solid's box can have a cavity")
-
-
-def _analytic_shape(key: str, shape: Shape, dim: int) -> Problems:
-    """Judge a shape that picks out points."""
-    yield from _plain_shape(key, shape, dim)
-    if shape.mesh is not None:
-        yield Problem(f"{key}.mesh", shape.mesh, "must be a box, ball, cylinder or halfspace here")
-
-
-def _solid_shape(key: str, shape: Shape, dim: int) -> Problems:
-    yield from _shape(key, shape, dim)
-    for kind in ("ball", "cylinder", "halfspace"):
-        if getattr(shape, kind) is not None:
-            yield Problem(f"{key}.{kind}", ABSENT, "a solid must be meshed: give a box with cells, or a mesh file")
-    if shape.box is not None and shape.box.cells is None:
-        yield Problem(f"{key}.box.cells", ABSENT, "is missing; a solid's box needs its number of cells per axis")
-    if shape.cavity is not None:
-        yield from _cavity(key, shape, dim)
-
-
-def _cavity(key: str, shape: Shape, dim: int) -> Problems:
-    box, cavity = shape.box, shape.cavity
-    assert cavity is not None
-    if box is None:
-        yield Problem(f"{key}.cavity", ABSENT, "belongs to a meshed box only", (f"{key}.box",))
-        return
-    yield from _box(f"{key}.cavity", cavity, dim)
-    if cavity.cells is not None:
-        yield Problem(f"{key}.cavity.cells", cavity.cells, "a cavity has the cells of its box; leave cells out")
-    if not (_is_measured(box, dim) and _is_measured(cavity, dim) and len(box.cells or ()) == dim):
-        return
-    taken = [_cells_within(box, cavity, axis) for axis in range(dim)]
-    if not all(taken):
-        yield Problem(f"{key}.cavity", ABSENT, "holds no cell's centre, so nothing is left out", (f"{key}.box",))
-    elif taken == box.cells:
-        yield Problem(f"{key}.cavity", ABSENT, "holds every cell's centre, so nothing is left", (f"{key}.box",))
-
-
-def _cells_within(box: Box, cavity: Box, axis: int) -> int:
-    """Return how many of the box's cells have their centre in the cavity, along one axis."""
-    assert box.cells is not None
-    n, low, size = box.cells[axis], cavity.origin[axis], cavity.size[axis]
-    centres = box.origin[axis] + box.size[axis] * (np.arange(n) + 0.5) / n
-    return int(np.count_nonzero((centres >= low) & (centres <= low + size)))
+# ---- obstacles ----------------------------------------------------------------------------------------------
 
 
 def _mesh_files(scene: Scene) -> Problems:
@@ -255,7 +149,19 @@ def _mesh_files(scene: Scene) -> Problems:
 
 def _obstacles(scene: Scene) -> Problems:
     for name, obstacle in scene.obstacles.items():
-        yield from _plain_shape(f"obstacles.{name}.shape", obstacle.shape, scene.dim)
+        key, shape = f"obstacles.{name}.shape", obstacle.shape
+        yield from plain_shape(key, shape, scene.dim)
+        if scene.fluid is not None and shape.halfspace is not None:
+            yield from _repeats(key, shape.halfspace, scene.fluid)
+
+
+def _repeats(key: str, halfspace: Halfspace, fluid: Fluid) -> Problems:
+    """Refuse a half space that its own images across periodic sides would fill up."""
+    for axis, component, (side, other) in zip("xyz", halfspace.normal, OPPOSITE, strict=False):
+        if component != 0 and getattr(fluid.sides, side) == getattr(fluid.sides, other) == "periodic":
+            allowed = f"must not lean along {axis}, whose sides are periodic"
+            uses = (f"fluid.sides.{side}", f"fluid.sides.{other}")
+            yield Problem(f"{key}.halfspace.normal", halfspace.normal, allowed, uses)
 
 
 # ---- solids -------------------------------------------------------------------------------------------------
@@ -264,14 +170,13 @@ def _obstacles(scene: Scene) -> Problems:
 def _solids(scene: Scene) -> Problems:
     for name, solid in scene.solids.items():
         key = f"solids.{name}"
-        yield from _solid_shape(f"{key}.shape", solid.shape, scene.dim)
-        yield from _length(f"{key}.initial.velocity", solid.initial.velocity, scene.dim)
-        yield from _length(f"{key}.initial.displacement", solid.initial.displacement, scene.dim)
+        yield from solid_shape(f"{key}.shape", solid.shape, scene.dim)
+        yield from length(f"{key}.initial.velocity", solid.initial.velocity, scene.dim)
+        yield from length(f"{key}.initial.displacement", solid.initial.displacement, scene.dim)
         yield from _supports(key, solid, scene.dim)
-        box = solid.shape.box
-        if scene.fluid is not None and box is not None and _is_measured(box, scene.dim):
-            high = [o + s for o, s in zip(box.origin, box.size, strict=True)]
-            yield from _outside_grid(scene.fluid, f"{key}.shape.box", box.origin, high)
+        corners = extent(solid.shape, scene.dim)
+        if scene.fluid is not None and corners is not None:
+            yield from _outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *corners)
     yield from _overlaps(scene)
 
 
@@ -279,7 +184,7 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
     for n, support in enumerate(solid.supports):
         here = f"{key}.supports.{n}"
         if isinstance(support.where, Shape):
-            yield from _analytic_shape(f"{here}.where", support.where, dim)
+            yield from analytic_shape(f"{here}.where", support.where, dim)
         elif support.where in OPPOSITE[2] and dim == 2:
             yield Problem(f"{here}.where", support.where, NO_Z, ("dim",))
         if "z" in support.fix and dim == 2:
@@ -294,7 +199,7 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
 
 def _outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
     """Yield a problem if a solid's bounding box does not lie in the grid."""
-    if not _is_measured(fluid, len(low)):
+    if not is_measured(fluid, len(low)):
         return
     for axis, a, b, start, size in zip("xyz", low, high, fluid.origin, fluid.size, strict=False):
         if a < start - SLACK * size or b > start + size + SLACK * size:
@@ -303,20 +208,16 @@ def _outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[f
 
 
 def _overlaps(scene: Scene) -> Problems:
-    """Refuse boxes that share material: no body may start inside another."""
-    boxes = [
-        (name, solid.shape.box)
+    """Refuse boxes and balls that share material: no body may start inside another."""
+    whole = [
+        (name, solid.shape)
         for name, solid in scene.solids.items()
-        if solid.shape.box is not None and solid.shape.cavity is None and _is_measured(solid.shape.box, scene.dim)
+        if solid.shape.cavity is None and extent(solid.shape, scene.dim) is not None
     ]
-    for (first, a), (second, b) in combinations(boxes, 2):
-        shared = [
-            min(p + m, q + n) - max(p, q) - SLACK * max(m, n)
-            for p, m, q, n in zip(a.origin, a.size, b.origin, b.size, strict=True)
-        ]
-        if min(shared) > 0:
+    for (first, a), (second, b) in combinations(whole, 2):
+        if overlap(a, b, scene.dim):
             allowed = f"overlaps solids.{first}; bodies must lie apart"
-            yield Problem(f"solids.{second}.shape.box", ABSENT, allowed, (f"solids.{first}.shape",))
+            yield Problem(f"solids.{second}.shape.{b.kinds[0]}", ABSENT, allowed, (f"solids.{first}.shape",))
 
 
 # ---- probes -------------------------------------------------------------------------------------------------
@@ -325,7 +226,7 @@ def _overlaps(scene: Scene) -> Problems:
 def _probes(scene: Scene) -> Problems:
     for name, probe in scene.probes.items():
         key = f"probes.{name}"
-        yield from _length(f"{key}.at", probe.at, scene.dim)
+        yield from length(f"{key}.at", probe.at, scene.dim)
         if probe.of == "fluid":
             yield from _fluid_probe(scene, key, probe)
         elif probe.of not in scene.solids:
@@ -379,7 +280,7 @@ def expressions(scene: Scene) -> Iterator[tuple[str, float | str, tuple[str, ...
 
 
 def _expressions(scene: Scene) -> Problems:
-    yield from _length("gravity", scene.gravity, scene.dim)
+    yield from length("gravity", scene.gravity, scene.dim)
     for key, source, variables in expressions(scene):
         try:
             Expression(source, variables, key)

@@ -104,6 +104,8 @@ def _allowed(entry: Mapping[str, Any]) -> str:
             return f"must be less than {context['lt']:g}"
         case "less_than_equal":
             return f"must be {context['le']:g} or less"
+        case "multiple_of":
+            return f"must be a multiple of {context['multiple_of']:g}"
         case "too_short":
             return "must not be empty"
     return entry["msg"]
@@ -232,4 +234,6 @@ def _stand_in(loc: list[Any], dim: int) -> Any:
         return dim
     if name == "end":  # of the time, or of a cylinder
         return 1.0 if loc[0] == "time" else [1.0] * dim
+    if name == "cells" and "ball" in loc:
+        return 2
     return [1] * dim if name in _VECTORS else copy.deepcopy(_STAND_IN.get(name))

@@ -80,10 +80,11 @@ class Box(Table):
 
 
 class Ball(Table):
-    """A disk (2D) or ball (3D)."""
+    """A disk (2D) or ball (3D); with ``cells``, how many it has across, it can be meshed."""
 
     centre: Annotated[Vector, Field(description="m")]
     radius: Annotated[Real, Field(gt=0, description="m")]
+    cells: Annotated[Annotated[Whole, Field(ge=2, multiple_of=2)] | None, Field(description="cells across")] = None
 
 
 class Cylinder(Table):
@@ -270,7 +271,7 @@ class Obstacle(Table):
 class Coupling(Table):
     """How fluid and solids are joined."""
 
-    transfer: Literal["ray"] = "ray"
+    transfer: Literal["cutcell", "ray"] = "cutcell"
     #: Facets are split until their pieces are about a cell / quadrature.
     quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
@@ -9,14 +11,20 @@ from petfsi.errors import InputError
 from petfsi.fields.base import FluidField, Reader, Slab, scalar_slab
 from petfsi.fields.mac import advect, kinds, pressure, views
 from petfsi.fields.mac.extrapolate import FAR, Band
+from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, evaluate_at, periodic_axes, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
+from petfsi.fields.mac.weight import Weight
 from petfsi.petsc import new_block, set_csr
-from petfsi.ranks import agreed
+from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene
+
+if TYPE_CHECKING:
+    from petfsi.fields.mac.cut import Walls, Wet
+    from petfsi.fields.mac.cutgrid import CutGrid, Openings
 
 
 class MacFluid(FluidField):
@@ -61,8 +69,10 @@ class MacFluid(FluidField):
         self.surroundings = Surroundings(grid, fluid.sides)
         advection = Advection(grid, self.surroundings, fluid.advection)
         self._transport = TRANSPORTS[scene.time.integrator](advection)
-        for name, obstacle in scene.obstacles.items():
-            self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)
+        self._cutter = self._make_cutter() if scene.coupling.transfer == "cutcell" else None
+        if self._cutter is None:
+            for name, obstacle in scene.obstacles.items():
+                self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)
 
         self._axes = range(grid.dim)
         self.velocity = [grid.zeros_faces(axis) for axis in self._axes]
@@ -72,19 +82,43 @@ class MacFluid(FluidField):
         self.smoke = None if fluid.smoke is None else grid.zeros_cells()
         self.cell_kind = np.full(grid.shape(None), FAR, dtype=np.uint8)
         self.face_kind = [grid.zeros_faces(axis, np.uint8) for axis in self._axes]
-        self.geometry_version = 0
+        self.openness = [np.ones(grid.shape(axis)) for axis in self._axes]
+        self.index = grid.index
+        self.extras: Extras | None = None
+        self._extra_pressure = np.zeros(0)
+        self._other_pressure: np.ndarray | None = None
+        self.volume: np.ndarray | None = None
+        self.geometry_version = self.kinds_version = 0
         self._bands = [Band(grid, axis) for axis in self._axes]
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
         self._gravity = [Expression(g, ("t",), key="gravity") for g in gravity]
+        # the ray transfer stays as it was published
+        exact = scene.coupling.transfer == "cutcell" and scene.gravity is not None
+        self.weight = Weight(grid, self.density, self._gravity) if exact else None
         self._regions: tuple[int, Regions] | None = None
 
         self.block = new_block(comm, self.layout, self.layout)
         self.rhs = np.zeros(self.layout.n_local)
         self._pattern = pressure.Pattern(grid)
         self._assembled_for: tuple[int, float] | None = None
-        self.immerse(None, None)
+        self._new_pattern = True
+        if self._cutter is None:
+            self.immerse(None, None)
+        else:
+            self.cut(np.zeros((0, self.dim)), np.zeros((0, self.dim), dtype=np.int64))
         self._start()
+
+    def _make_cutter(self) -> CutGrid | None:
+        """Return what cuts the grid, if the scene has anything to cut it with. Collective."""
+        scene = self.scene
+        if not scene.solids and not scene.obstacles:
+            return None
+        from petfsi.fields.mac.cutgrid import CutGrid
+        from petfsi.geometry.obstacles import obstacle_surfaces
+
+        surfaces = on_root(self.comm, lambda: obstacle_surfaces(scene))
+        return CutGrid(self.grid, self.surroundings, surfaces.points, surfaces.facets, surfaces.base)
 
     def _start(self) -> None:
         """Set velocity and smoke as the scene says for time zero. Collective."""
@@ -139,11 +173,49 @@ class MacFluid(FluidField):
             face_kind.append(kind)
         if self.comm.allreduce(changed, op=MPI.LOR):
             self.cell_kind, self.face_kind = cell_kind, face_kind
-            self._geometry_changed()
+            self.geometry_version += 1
+            self._kinds_changed()
 
-    def _geometry_changed(self) -> None:
-        """Refresh what follows from the kinds. Collective."""
+    def cut(self, points: np.ndarray, facets: np.ndarray) -> tuple[Walls, Wet]:
+        """Take over which parts of cells and faces a surface covers; return what it lets through, and bears. Collective.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n, dim)
+            The same on all ranks.
+        facets : ndarray of int, shape (m, dim)
+            Segments or triangles with normals into the fluid.
+        """
+        assert self._cutter is not None
+        found = self._cutter.cut(points, facets)
+        changed = any(
+            not np.array_equal(new, old)
+            for new, old in zip([found.cell_kind, *found.face_kind], [self.cell_kind, *self.face_kind], strict=True)
+        )
+        if found.extras is not None or self.extras is not None:
+            changed = changed or found.extras is None or not found.extras.same(self.extras)
+        if self.comm.allreduce(changed, op=MPI.LOR):
+            self._renumber(found)
+            self.cell_kind, self.face_kind = found.cell_kind, found.face_kind
+            self._kinds_changed()
+        self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.geometry_version += 1
+        return found.walls, found.wet
+
+    def _renumber(self, found: Openings) -> None:
+        """Take over the unknowns of split cells; the others keep their place. Collective."""
+        self._new_pattern |= found.extras is not None or self.extras is not None
+        self.extras, self.index = found.extras, found.index
+        known = self.pressure if self._other_pressure is None else self._other_pressure
+        self._extra_pressure = np.zeros(0) if found.extras is None else known.reshape(-1)[found.extras.cell]
+        if found.layout != self.layout:
+            self.layout = found.layout
+            self.block = new_block(self.comm, self.layout, self.layout)
+            self.rhs = np.zeros(self.layout.n_local)
+
+    def _kinds_changed(self) -> None:
+        """Refresh what follows from the kinds. Collective."""
+        self.kinds_version += 1
         kind_x, kind_y, kind_z = three(self.face_kind)
         self._active = pressure.active_cells(self.cell_kind, kind_x, kind_y, kind_z, self.dim == 2)
         for axis in self._axes:
@@ -162,29 +234,48 @@ class MacFluid(FluidField):
         Parameters
         ----------
         touched : ndarray of bool or None
-            Cell array: cells that a coupling acts on.
+            This rank's unknowns that a coupling acts on.
 
         Returns
         -------
         list of (ndarray, bool)
-            Per region 1 on its cells and 0 elsewhere (this rank's part, in PETSc's order), and whether any of its
-            cells is touched.
+            Per region 1 on its unknowns and 0 elsewhere (this rank's part), and whether any of them is touched.
         """
-        if self._regions is None or self._regions[0] != self.geometry_version:
+        if self._regions is None or self._regions[0] != self.kinds_version:
             linked = np.zeros_like(self._active)
             for axis in self._axes:
-                acts = np.isin(self.face_kind[axis], (kinds.PRESSURE, kinds.OPEN))
+                acts = np.isin(self.face_kind[axis], (kinds.PRESSURE, kinds.OPEN, kinds.SPLIT))
                 linked |= np.delete(acts, 0, axis) | np.delete(acts, -1, axis)
-            found = find_regions(self.grid, self._active & linked, self.face_kind)
-            self._regions = (self.geometry_version, found)
+            found = find_regions(self.grid, self._active & linked, self.face_kind, self.layout, self.index, self.extras)
+            self._regions = (self.kinds_version, found)
         regions = self._regions[1]
         return list(zip(regions.members, regions.touching(touched), strict=True))
+
+    def volumes(self) -> np.ndarray:
+        """Return the volume of fluid that belongs to each of this rank's unknowns, m^3 (m^2 in 2D)."""
+        if self.volume is None:
+            volume = self.grid.to_vec(self._active).astype(float)
+        else:
+            volume = self.grid.to_vec(self.volume)
+        if self.extras is not None:
+            whole = self.volume.copy()
+            np.subtract.at(whole.reshape(-1), self.extras.cell, self.extras.volume)
+            volume = np.concatenate((self.grid.to_vec(whole), self.extras.volume))
+        return self.cell_volume * volume
 
     # ---- the step ---------------------------------------------------------------------------------------------
 
     def unknown(self) -> np.ndarray:
-        """Return the pressure of this rank's cells, Pa, in PETSc's order."""
-        return self.grid.to_vec(self.pressure)
+        """Return the pressure of this rank's cells and of its extra unknowns, Pa, in PETSc's order.
+
+        Where there is a ``weight``, less that of the fluid at rest.
+        """
+        cells, extra = self.grid.to_vec(self.pressure), self._extra_pressure
+        if self.weight is not None:
+            rest = self.weight.pressure()
+            cells = cells - self.grid.to_vec(np.where(self._active, rest, 0.0))
+            extra = extra if self.extras is None else extra - rest.reshape(-1)[self.extras.cell]
+        return np.concatenate((cells, extra))
 
     def predict(self, time: float, dt: float) -> None:
         """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
@@ -205,6 +296,9 @@ class MacFluid(FluidField):
         buoyancy = 0.0
         if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
             buoyancy = self.scene.fluid.smoke.buoyancy
+        if self.weight is not None:
+            self.weight.at(time)
+            self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
         for axis in self._axes:
             star, kind = self.velocity_star[axis], self.face_kind[axis]
             dv = duration * float(self._gravity[axis](t=time))
@@ -213,7 +307,7 @@ class MacFluid(FluidField):
                 self.boundary_velocity[axis],
                 kind,
                 kinds.STEP[axis],
-                dv,
+                dv if self.weight is None else 0.0,
                 self.pressure if smoke is None else smoke,
                 -buoyancy * dv,
                 self._part(axis),
@@ -228,26 +322,38 @@ class MacFluid(FluidField):
         part = self._part(None)
         factor = self._transport.factor(dt)
         if self._assembled_for != (self.geometry_version, factor):
-            c = factor / self.density * grid.cell_volume / grid.dx**2
-            values = np.zeros(len(self._pattern.indices))
-            kind_x, kind_y, kind_z = three(self.face_kind)
-            pressure.laplacian(self._active, kind_x, kind_y, kind_z, part, self._pattern.slot, c, values)
-            first = self._assembled_for is None
-            set_csr(self.block, self._pattern.indptr, self._pattern.indices, values, new_pattern=first)
-            self._assembled_for = (self.geometry_version, factor)
-            self.n_assembled += 1
+            self._assemble_block(factor)
         self.rhs[:] = 0.0
+        areas = np.array([grid.face_area(axis) for axis in self._axes])
         for axis in self._axes:
             pressure.known_inflow(
                 self._active,
                 self.velocity_star[axis],
                 self.boundary_velocity[axis],
                 self.face_kind[axis],
+                self.openness[axis],
                 kinds.STEP[axis],
-                grid.face_area(axis),
+                areas[axis],
                 part,
                 self.rhs,
             )
+        if self.extras is not None:
+            self.extras.add_inflow(self.velocity_star, areas, self.layout, self.rhs)
+
+    def _assemble_block(self, factor: float) -> None:
+        """Fill L for the step's factor (see ``transport``). Collective."""
+        grid, pattern = self.grid, self._pattern
+        c = factor / self.density * grid.cell_volume / grid.dx**2
+        values = np.zeros(len(pattern.indices))
+        arrays = (*three(self.face_kind), *three(self.openness))
+        pressure.laplacian(self._active, *arrays, self._part(None), pattern.slot, c, values)
+        rows = pattern.indptr, pattern.indices, values
+        if self.extras is not None:
+            rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
+        set_csr(self.block, *rows, new_pattern=self._new_pattern)
+        self._new_pattern = False
+        self._assembled_for = (self.geometry_version, factor)
+        self.n_assembled += 1
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the pressure and set the velocity that goes with it. Collective.
@@ -255,7 +361,8 @@ class MacFluid(FluidField):
         Smoke has moved in ``predict`` already; here cells that are fluid only now get the mean of their neighbours.
         """
         grid, factor = self.grid, self._transport.factor(dt)
-        grid.from_vec(x, self.pressure)
+        n_cells = grid.layout.n_local
+        grid.from_vec(x[:n_cells], self.pressure)
         grid.exchange_cells(self.pressure)
         solved = [np.zeros_like(v) for v in self.velocity]
         for axis in self._axes:
@@ -269,10 +376,30 @@ class MacFluid(FluidField):
                 self._part(axis),
                 solved[axis],
             )
+        if self.extras is not None:
+            self._extra_pressure = x[n_cells:].copy()
+            self.extras.project(
+                self.velocity_star, self._extra_pressure, self.layout.start + n_cells, self.pressure, self.index,
+                factor / (self.density * grid.dx), solved, self.comm,
+            )  # fmt: skip
+        if self.weight is not None:
+            rest = self.weight.pressure()
+            self.pressure += np.where(self._active, rest, 0.0)
+            if self.extras is not None:
+                self._extra_pressure += rest.reshape(-1)[self.extras.cell]
+        if self.extras is not None or self._other_pressure is not None:
+            self._remember_extras()
         self._complete_faces(solved)
         self.velocity = self._transport.accept(self.velocity, solved, self.face_kind, dt, self._complete_faces)
         if self.smoke is not None:
             self._complete_cells(self.smoke)
+
+    def _remember_extras(self) -> None:
+        """Keep the pressure of the second piece of split cells where the next step's cells can find it."""
+        self._other_pressure = self.pressure.copy()
+        if self.extras is not None:
+            second = self.extras.piece == 1
+            self._other_pressure.reshape(-1)[self.extras.cell[second]] = self._extra_pressure[second]
 
     def _complete(self) -> None:
         """Fill ghosts, bands and what lies beyond the sides. Collective."""
@@ -298,17 +425,6 @@ class MacFluid(FluidField):
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
         most = max(advect.largest(v) * dt / h for v, h in zip(self.velocity, self.grid.dx, strict=True))
         return self.comm.allreduce(most, op=MPI.MAX)
-
-    def max_divergence(self) -> float:
-        """Return the largest net outflow of a solved cell over the area of a (cubic) cell's face, m/s. Collective.
-
-        Of the velocity that the last step solved for.
-        """
-        areas = np.array([self.grid.face_area(axis) for axis in self._axes])
-        u, v, w = three(self._transport.solved(self.velocity))
-        most = pressure.largest_outflow(self._active, u, v, w, areas, self._part(None))
-        scale = self.grid.cell_volume ** ((self.dim - 1) / self.dim)
-        return self.comm.allreduce(most, op=MPI.MAX) / scale
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy of the fluid cells, J (in 2D per metre of thickness). Collective."""
@@ -349,7 +465,8 @@ class MacFluid(FluidField):
             self.grid.fill_sides(array, axis)
         if self._transport.past:
             self._transport.past_dt = float(read("past_dt", (0,), (1,))[0])
-        self._geometry_changed()
+        self.geometry_version += 1
+        self._kinds_changed()
         self._complete()
 
     def _stored_past(self) -> list[tuple[str, np.ndarray, int | None]]:
@@ -367,6 +484,10 @@ class MacFluid(FluidField):
             stored.append((f"face_kind_{letter}", self.face_kind[axis], axis))
         if self.smoke is not None:
             stored.append(("smoke", self.smoke, None))
+        if self._cutter is not None and self.scene.solids:
+            if self._other_pressure is None:
+                self._other_pressure = self.pressure.copy()
+            stored.append(("pressure_other", self._other_pressure, None))
         return stored
 
     # ---- for the kernels --------------------------------------------------------------------------------------

@@ -156,10 +156,13 @@ class MacGrid:
             return np.zeros(len(i))
         return self.origin[axis] + i * self.dx[axis]
 
+    def lines(self, axis: int | None) -> list[np.ndarray]:
+        """Return the coordinates along x, y, z (z = 0 in 2D) of the local faces of ``axis`` (cells: None), m."""
+        return [self.face_coords(b) if b == axis else self.cell_centres(b) for b in range(3)]
+
     def coordinates(self, axis: int | None) -> list[np.ndarray]:
         """Return x, y, z (as open grids, z = 0 in 2D) of the local faces of ``axis`` (cells: None)."""
-        lines = [self.face_coords(b) if b == axis else self.cell_centres(b) for b in range(3)]
-        return list(np.meshgrid(*lines, indexing="ij", sparse=True))
+        return list(np.meshgrid(*self.lines(axis), indexing="ij", sparse=True))
 
     # ---- exchange ---------------------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ PRESSURE = 1  # between two fluid cells
 OPEN = 2  # between fluid and an open side: p = 0 at the face
 WALL = 3  # velocity prescribed by a side, an inflow or an obstacle
 SOLID_FACE = 4  # velocity given by a coupling
+SPLIT = 5  # of a cell with several pieces of fluid: its parts join unknowns as the openings' extras say
 
 #: Unit steps along the axes, for kernels that serve every axis.
 STEP = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

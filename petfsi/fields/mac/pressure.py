@@ -87,7 +87,7 @@ def _conductance(kind, c):
 
 
 @njit(cache=True)
-def laplacian(active, kind0, kind1, kind2, part, slot, c, values):
+def laplacian(active, kind0, kind1, kind2, open0, open1, open2, part, slot, c, values):
     """Write all values of L.
 
     Parameters
@@ -96,6 +96,8 @@ def laplacian(active, kind0, kind1, kind2, part, slot, c, values):
         Cell array.
     kind0, kind1, kind2 : ndarray of uint8
         Face kinds; in 2D the last is not read.
+    open0, open1, open2 : ndarray
+        Face arrays: how much of a whole face lets fluid through.
     part : tuple of (int, int)
         The owned cells.
     slot : ndarray
@@ -120,11 +122,17 @@ def laplacian(active, kind0, kind1, kind2, part, slot, c, values):
                 kinds_below[1], kinds_above[1] = kind1[i, j, k], kind1[i, j + 1, k]
                 if not flat:
                     kinds_below[2], kinds_above[2] = kind2[i, j, k], kind2[i, j, k + 1]
+                below[0], above[0] = c[0] * open0[i, j, k], c[0] * open0[i + 1, j, k]
+                below[1], above[1] = c[1] * open1[i, j, k], c[1] * open1[i, j + 1, k]
+                if not flat:
+                    below[2], above[2] = c[2] * open2[i, j, k], c[2] * open2[i, j, k + 1]
                 diagonal = 0.0
                 for a in range(len(c)):
-                    below[a] = c[a] if active[i, j, k] and kinds_below[a] == PRESSURE else 0.0
-                    above[a] = c[a] if active[i, j, k] and kinds_above[a] == PRESSURE else 0.0
-                    diagonal += _conductance(kinds_below[a], c[a]) + _conductance(kinds_above[a], c[a])
+                    diagonal += _conductance(kinds_below[a], below[a]) + _conductance(kinds_above[a], above[a])
+                    if not active[i, j, k] or kinds_below[a] != PRESSURE:
+                        below[a] = 0.0
+                    if not active[i, j, k] or kinds_above[a] != PRESSURE:
+                        above[a] = 0.0
                     if slot[row, 1 + 2 * a] >= 0:
                         values[slot[row, 1 + 2 * a]] = -below[a]
                     if slot[row, 2 + 2 * a] >= 0:
@@ -147,7 +155,7 @@ def _flux(star, bound, kind, i, j, k):
 
 
 @njit(cache=True)
-def known_inflow(active, star, bound, kind, step, area, part, out):
+def known_inflow(active, star, bound, kind, openness, step, area, part, out):
     """Add minus the net outflow through one axis' faces, without SOLID_FACEs, to ``out`` in the DMDA's order."""
     (b0, e0), (b1, e1), (b2, e2) = part
     di, dj, dk = step
@@ -156,8 +164,8 @@ def known_inflow(active, star, bound, kind, step, area, part, out):
             for k in range(b2, e2):
                 if active[i, j, k]:
                     row = (i - b0) + (e0 - b0) * ((j - b1) + (e1 - b1) * (k - b2))
-                    above = _flux(star, bound, kind, i + di, j + dj, k + dk)
-                    out[row] -= area * (above - _flux(star, bound, kind, i, j, k))
+                    above = openness[i + di, j + dj, k + dk] * _flux(star, bound, kind, i + di, j + dj, k + dk)
+                    out[row] -= area * (above - openness[i, j, k] * _flux(star, bound, kind, i, j, k))
 
 
 @njit(cache=True)
@@ -197,28 +205,6 @@ def add_forces(star, bound, kind, step, dv, smoke, dv_smoke, part):
                     if dv_smoke != 0.0:
                         mean = 0.5 * (smoke[i, j, k] + smoke[i - di, j - dj, k - dk])
                         star[i, j, k] += dv_smoke * mean
-
-
-@njit(cache=True)
-def outflow(u, v, w, i, j, k, areas):
-    """Return the net outflow of a cell, m^3/s; ``areas`` has dim entries."""
-    total = areas[0] * (u[i + 1, j, k] - u[i, j, k]) + areas[1] * (v[i, j + 1, k] - v[i, j, k])
-    if len(areas) == 3:
-        total += areas[2] * (w[i, j, k + 1] - w[i, j, k])
-    return total
-
-
-@njit(cache=True)
-def largest_outflow(active, u, v, w, areas, part):
-    """Return the largest magnitude of the net outflow of the solved cells, m^3/s."""
-    (b0, e0), (b1, e1), (b2, e2) = part
-    most = 0.0
-    for i in range(b0, e0):
-        for j in range(b1, e1):
-            for k in range(b2, e2):
-                if active[i, j, k]:
-                    most = max(most, abs(outflow(u, v, w, i, j, k, areas)))
-    return most
 
 
 @njit(cache=True)

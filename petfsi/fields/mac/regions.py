@@ -9,8 +9,10 @@ from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.kinds import OPEN, PRESSURE
+from petfsi.petsc import Layout
 
 
 @njit(cache=True)
@@ -72,24 +74,30 @@ class Regions:
     Attributes
     ----------
     members : list of ndarray
-        Per region 1 for its cells on this rank and 0 for the others, in the DMDA's order. Regions are in the order
-        of their first cells in the global grid, on any number of ranks.
+        Per region 1 for its unknowns on this rank and 0 for the others. Regions are in the order of their first cells
+        in the global grid, on any number of ranks.
     """
 
     grid: MacGrid
     members: list[np.ndarray]
 
     def touching(self, touched: np.ndarray | None) -> list[bool]:
-        """Return for each region whether any rank has one of its cells marked. Collective."""
+        """Return for each region whether any rank has one of its unknowns marked. Collective."""
         if touched is None or not self.members:
             return [False] * len(self.members)
-        marked = self.grid.to_vec(touched).astype(float)
-        here = np.array([marked @ vec > 0 for vec in self.members])
+        here = np.array([touched.astype(float) @ vec > 0 for vec in self.members])
         return [bool(t) for t in np.logical_or.reduce(self.grid.comm.allgather(here))]
 
 
-def find_regions(grid: MacGrid, active: np.ndarray, face_kind: list[np.ndarray]) -> Regions:
-    """Return the closed regions among the active cells. Collective."""
+def find_regions(
+    grid: MacGrid,
+    active: np.ndarray,
+    face_kind: list[np.ndarray],
+    layout: Layout,
+    index: np.ndarray,
+    extras: Extras | None,
+) -> Regions:
+    """Return the closed regions among the active cells and the extra unknowns. Collective."""
     comm = grid.comm
     labels = np.full(grid.shape(None), -1, dtype=np.int64)
     own = grid.owned(None)
@@ -98,13 +106,19 @@ def find_regions(grid: MacGrid, active: np.ndarray, face_kind: list[np.ndarray])
     first = _label(active, kind_x, kind_y, kind_z, part, grid.dim == 2, labels)
     place = np.unravel_index(first, grid.owned_shape)
     natural = np.ravel_multi_index([p + m for p, m in zip(place, grid.lo, strict=True)], grid.cells)
-    counts = comm.allgather(len(first))
+    n_extra = 0 if extras is None else len(extras.cell)
+    n_labels = len(first) + n_extra
+    if extras is not None:
+        # an extra unknown counts from the start as a region of its own, which comes after its cell
+        cell = np.array(np.unravel_index(extras.cell, grid.shape(None))) - np.array(grid.ghost)[:, None]
+        natural = np.concatenate((natural, np.ravel_multi_index(cell + np.array(grid.lo)[:, None], grid.cells)))
+    counts = comm.allgather(n_labels)
     offset = sum(counts[: comm.rank])
     labels[labels >= 0] += offset
     grid.exchange_cells(labels, width=1)
 
     pairs = _pairs(grid, labels, face_kind)
-    is_open = np.zeros(len(first), dtype=bool)
+    is_open = np.zeros(n_labels, dtype=bool)
     for axis, kind in enumerate(face_kind):
         for shift in (0, 1):
             faces = list(own)
@@ -112,6 +126,9 @@ def find_regions(grid: MacGrid, active: np.ndarray, face_kind: list[np.ndarray])
             at = labels[own][kind[tuple(faces)] == OPEN]
             is_open[at[at >= 0] - offset] = True
 
+    if extras is not None:
+        of_unknown = np.concatenate((grid.to_vec(labels), offset + len(first) + np.arange(n_extra)))
+        pairs = np.concatenate((pairs, _extra_pairs(grid, labels, of_unknown, layout, index, extras, is_open, offset)))
     links = np.concatenate(comm.allgather(pairs))
     total = sum(counts)
     if total == 0:
@@ -122,7 +139,7 @@ def find_regions(grid: MacGrid, active: np.ndarray, face_kind: list[np.ndarray])
     begin = np.full(n_regions, np.iinfo(np.int64).max)
     np.minimum.at(begin, region, np.concatenate(comm.allgather(natural)))
     closed = [r for r in np.argsort(begin, kind="stable") if not has_exit[r]]
-    label = grid.to_vec(labels)
+    label = np.concatenate((grid.to_vec(labels), offset + len(first) + np.arange(n_extra)))
     mine = np.where(label >= 0, region[label], -1)
     return Regions(grid, [(mine == r).astype(float) for r in closed])
 
@@ -138,3 +155,27 @@ def _pairs(grid: MacGrid, labels: np.ndarray, face_kind: list[np.ndarray]) -> np
         joined = kind[tuple(plane)] == PRESSURE
         found.append(np.stack([labels[tuple(plane)][joined], labels[tuple(behind)][joined]], axis=1))
     return np.unique(np.concatenate(found), axis=0)
+
+
+def _extra_pairs(
+    grid: MacGrid, labels: np.ndarray, of_unknown: np.ndarray, layout: Layout, index: np.ndarray, extras: Extras,
+    is_open: np.ndarray, offset: int,
+) -> np.ndarray:  # fmt: skip
+    """Return the label pairs that the links of split cells join, and note which labels reach an open side. Collective."""
+    numbers = np.concatenate(grid.comm.allgather(layout.start + np.arange(grid.layout.n_local, layout.n_local)))
+    every = np.concatenate(grid.comm.allgather(of_unknown[grid.layout.n_local :]))
+    ends = []
+    for number, step in ((extras.below, -1), (extras.above, 0)):
+        label = np.full(len(number), -1, dtype=np.int64)
+        for a in range(grid.dim):
+            at = np.flatnonzero((extras.axis == a) & (number >= 0))
+            where = list(np.unravel_index(extras.face[at], grid.shape(a)))
+            where[a] = where[a] + step
+            own = index[tuple(where)] == number[at]
+            label[at] = labels[tuple(where)]
+            label[at[~own]] = every[np.searchsorted(numbers, number[at[~own]])]
+        ends.append(label)
+    inner = (ends[0] >= 0) & (ends[1] >= 0)
+    exits = np.maximum(*ends)[(extras.below < 0) | (extras.above < 0)] - offset
+    is_open[exits[(exits >= 0) & (exits < len(is_open))]] = True
+    return np.stack(ends, axis=1)[inner]

@@ -1,0 +1,121 @@
+"""The exact transfer between a regular grid and a surface: facets clipped against cells."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_matrix
+
+from petfsi.couplings.base import Coupling
+from petfsi.fields.base import SolidField
+from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
+from petfsi.scene import schema
+
+if TYPE_CHECKING:
+    from petfsi.fields.mac.cut import Wet
+    from petfsi.fields.mac.fluid import MacFluid
+
+
+class CutCellCoupling(Coupling):
+    """Couples a MAC fluid and a solid's surface without loss: D1 H = J^T.
+
+    What the walls of a cell let through when they move is J^T u, and J p is the pressure's force on them; see
+    ``fields.mac.cut`` for the entries. The coupling does no work of its own, a closed cavity keeps its volume to
+    the solver's tolerance, and the system is symmetric quasi-definite.
+    """
+
+    def __init__(self, fluid: MacFluid, solid: SolidField, spec: schema.Coupling) -> None:
+        self.fluid, self.solid = fluid, solid
+        self.comm: MPI.Comm = fluid.comm
+        self.dim = fluid.dim
+        self.surface = solid.surface()
+        # a cavity that holds nothing is no room for the fluid: without its walls it counts as solid
+        self.facets = self.surface.facets[~self.surface.void]
+        # the surface's own unknowns alone, so that no product runs over all of the solid's
+        self._free = np.unique(self.surface.point_map.indices)
+        self._free_map = self.surface.point_map[:, self._free]
+        self._new_blocks()
+        self._positions: np.ndarray | None = None
+        self._patterns: list[tuple[np.ndarray, ...]] = []
+        self._stale, self._dt = False, 0.0
+
+    def _new_blocks(self) -> None:
+        fluid, solid = self.fluid, self.solid
+        self.layout = fluid.layout
+        self.flux_block = new_block(self.comm, fluid.layout, solid.layout)
+        self.force_block = new_block(self.comm, solid.layout, fluid.layout)
+        self.blocks: dict[tuple[str, str], PETSc.Mat] = {
+            (fluid.name, solid.name): self.flux_block,
+            (solid.name, fluid.name): self.force_block,
+        }
+        self._patterns = []
+
+    def couple(self, time: float, dt: float) -> None:
+        """Cut the grid and make J; nothing if no point moved."""
+        positions = self.solid.surface_positions()
+        if self._positions is not None and np.array_equal(positions, self._positions):
+            return
+        self._positions = positions.copy()
+        walls, wet = self.fluid.cut(positions, self.facets)
+        layout = self.fluid.layout
+        points = self.facets[walls.facet] * self.dim + walls.axis[:, None]
+        rows = np.repeat(walls.slot - layout.start, self.dim)
+        shape = (layout.n_local, self._free_map.shape[0])
+        self._point_flux = csr_matrix((walls.flux.ravel(), (rows, points.ravel())), shape=shape)
+        flux = (self._point_flux @ self._free_map).tocsr()
+        flux.sort_indices()
+        self.touched = np.diff(flux.indptr) > 0
+        columns = self._free[flux.indices].astype(IntType)
+        cells = layout.start + np.repeat(np.arange(layout.n_local), np.diff(flux.indptr))
+        force = gather_triplets(self.comm, self.solid.layout, columns, cells, -flux.data)
+        self._rows = [(flux.indptr.astype(IntType), columns, flux.data), force]
+        if self.fluid.weight is not None:
+            self._weight = self._rest_force(wet)
+        self._stale = True
+        self.n_coupled += 1
+
+    def _rest_force(self, wet: Wet) -> csr_matrix:
+        """Return the force of a linear pressure, zero in the grid's upper corner, by its gradient. Collective.
+
+        Shape (unknowns of the solid on this rank, dim), m^3 (m^2 in 2D):  -∫ N_i n (x_b - x_0,b) dA.
+        """
+        dim, layout = self.dim, self.solid.layout
+        points = (self.facets[wet.facet] * dim)[:, :, None] + np.arange(dim)
+        rows = np.repeat(points.ravel(), dim)
+        columns = np.tile(np.arange(dim), points.size)
+        by_point = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))
+        force = (self._free_map.T @ by_point).tocoo()
+        rows = gather_triplets(self.comm, layout, self._free[force.row], force.col.astype(np.int64), force.data)
+        return csr_matrix((rows[2], rows[1], rows[0]), shape=(layout.n_local, dim))
+
+    def assemble(self, time: float, dt: float) -> None:
+        """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
+        if self.layout != self.fluid.layout:
+            self._new_blocks()
+        # whoever solves may scale the blocks in place, by amounts that depend on dt
+        if self._stale or dt != self._dt:
+            self._fill()
+            self._stale, self._dt = False, dt
+        if self.surface.fixed_map.nnz:
+            self.fluid.rhs -= self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+        if self.fluid.weight is not None:
+            self.solid.rhs += self._weight @ self.fluid.weight.gradient
+
+    def _fill(self) -> None:
+        patterns: list[tuple[np.ndarray, ...]] = [rows[:2] for rows in self._rows]
+        new = 0
+        for bit, pattern in enumerate(patterns):
+            if not self._patterns or not all(map(np.array_equal, pattern, self._patterns[bit])):
+                new |= 1 << bit
+        new = self.comm.allreduce(new, op=MPI.BOR)
+        for bit, block in enumerate((self.flux_block, self.force_block)):
+            set_csr(block, *self._rows[bit], new_pattern=bool(new >> bit & 1))
+        self._patterns = patterns
+        self.pattern_version += new > 0
+        self.n_assembled += 1
+
+    def accept(self, time: float, dt: float) -> None:
+        """Do nothing: no face takes its velocity from the solid."""

@@ -1,0 +1,260 @@
+"""The openings of a distributed grid that surfaces cut: kinds, openness and unknowns of its cells and faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from mpi4py import MPI
+from numba import njit
+
+from petfsi.fields.mac import kinds
+from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, join, patch_slots
+from petfsi.fields.mac.extras import Extras
+from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.sides import Surroundings
+from petfsi.geometry.clipping import Lattice, cut
+from petfsi.petsc import IntType, Layout
+
+
+@dataclass(frozen=True)
+class Openings:
+    """The grid as surfaces leave it; arrays are local, valid in all ghosts.
+
+    Attributes
+    ----------
+    cell_kind : ndarray of uint8
+    face_kind : list of ndarray of uint8
+    openness : list of ndarray
+        B_f of faces that are not SPLIT, see ``cut``.
+    volume : ndarray
+        Open part of each cell's volume.
+    layout : Layout
+        Of the unknowns: this rank's cells in the DMDA's order, then its extras.
+    index : ndarray of IntType
+        Cell array of the unknowns' global numbers.
+    extras : Extras or None
+        None if no rank has any split cell.
+    walls : Walls
+        Slots are global numbers of unknowns; entries of unknowns that are not solved are left out.
+    wet : Wet
+        About the upper corner of the grid.
+    """
+
+    cell_kind: np.ndarray
+    face_kind: list[np.ndarray]
+    openness: list[np.ndarray]
+    volume: np.ndarray
+    layout: Layout
+    index: np.ndarray
+    extras: Extras | None
+    walls: Walls
+    wet: Wet
+
+
+class CutGrid:
+    """Cuts a grid by the surfaces of obstacles, which never move, and of solids.
+
+    Parameters
+    ----------
+    grid : MacGrid
+    surroundings : Surroundings
+        The sides; obstacles are not looked at.
+    points, facets : ndarray
+        Surfaces of the obstacles.
+    base : int
+        How many of them are containers.
+    """
+
+    def __init__(
+        self, grid: MacGrid, surroundings: Surroundings, points: np.ndarray, facets: np.ndarray, base: int
+    ) -> None:
+        self.grid, self.surroundings = grid, surroundings
+        self.points, self.facets, self.base = points, facets, base
+        dim = grid.dim
+        lo, hi = np.array(grid.lo[:dim]), np.array(grid.hi[:dim])
+        free = np.array(grid.periodic[:dim])
+        # one layer of ghosts: faces between ranks look at the walls of both their cells
+        lo = np.where(free | (lo > 0), lo - 1, lo)
+        hi = np.where(free | (hi < np.array(grid.cells[:dim])), hi + 1, hi)
+        self.lattice = Lattice(grid.origin, grid.dx, np.array(grid.cells[:dim]), free, lo, hi)
+        self.shape = tuple(int(n) for n in hi - lo)
+        begin = [int(lo[a]) - grid.lo[a] + grid.ghost[a] for a in range(dim)] + [0] * (3 - dim)
+        size = self.shape + (1,) * (3 - dim)
+        self._box = tuple(slice(b, b + n) for b, n in zip(begin, size, strict=True))
+        self._sides = [self._part(surroundings.side_kind[a], a) for a in range(dim)]
+        self._flat = np.arange(int(np.prod(grid.shape(None)))).reshape(grid.shape(None))[self._box].reshape(-1)
+        self._flat_faces = [
+            self._part(np.arange(int(np.prod(grid.shape(a)))).reshape(grid.shape(a)), a).reshape(-1) for a in range(dim)
+        ]
+        static = self.cut(np.zeros((0, dim)), np.zeros((0, dim), dtype=np.int64))
+        self.covered = static.cell_kind != kinds.FLUID
+
+    def _part(self, array: np.ndarray, axis: int | None) -> np.ndarray:
+        """Return the box's part of a local array of faces of ``axis`` (cells: None), without the third axis in 2D."""
+        part = tuple(slice(s.start, s.stop + (b == axis)) for b, s in enumerate(self._box))
+        view = array[part]
+        return view if self.grid.dim == 3 else view[:, :, 0]
+
+    def cut(self, points: np.ndarray, facets: np.ndarray) -> Openings:
+        """Return the openings that obstacles and a surface leave. Collective.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n, dim)
+            The surface's points, the same on all ranks.
+        facets : ndarray of int, shape (m, dim)
+        """
+        grid = self.grid
+        every = np.concatenate((points, self.points)), np.concatenate((facets, self.facets + len(points)))
+        found = cut(*every, self.lattice, self.base)
+        links, walls = join(found, self.shape, grid.dx, self._sides, len(facets))
+        links = self._without_walls(links)
+        openness = []
+        split = []
+        for a in range(grid.dim):
+            whole = grid.zeros_faces(a)
+            part = self._part(whole, a)
+            part[...] = found.open[a]
+            plain = (links.axis == a) & ~links.split
+            whole.reshape(-1)[self._flat_faces[a][links.face[plain]]] = links.openness[plain]
+            torn = np.unique(self._flat_faces[a][links.face[(links.axis == a) & links.split]])
+            whole.reshape(-1)[torn] = 0.0
+            grid.exchange_faces(a, whole)
+            openness.append(whole)
+            split.append(torn)
+        volume = grid.zeros_cells()
+        self._part(volume, None)[...] = found.volume
+        grid.exchange_cells(volume)
+        cell_kind, face_kind = self._kinds(openness, split)
+        layout, index, extras, slots = self._number(found, links)
+        numbers = slots[walls.slot]
+        # a ghost may stand for a cell of this rank itself, which has its own entries
+        own = np.zeros(grid.shape(None), dtype=bool)
+        own[grid.owned(None)] = True
+        own = own.reshape(-1)[self._flat]
+        solved = own & (cell_kind.reshape(-1)[self._flat] == kinds.FLUID)
+        solved = np.concatenate((solved, own[found.extra_cell]))
+        used = np.flatnonzero(solved[walls.slot])
+        walls = Walls(walls.facet[used], walls.axis[used], numbers[used], walls.flux[used])
+        patches = np.flatnonzero(solved[patch_slots(found, len(self._flat))] & (found.facet < len(facets)))
+        wet = first_moments(found, patches, self._centres(found.cell[patches]))
+        return Openings(cell_kind, face_kind, openness, volume, layout, index, extras, walls, wet)
+
+    def _centres(self, cell: np.ndarray) -> np.ndarray:
+        """Return the centres of cells of the box from the upper corner of the grid, (n, dim)."""
+        grid = self.grid
+        index = np.stack(np.unravel_index(cell, self.shape), axis=1) + self.lattice.lo
+        return (index + 0.5) * grid.dx - grid.size
+
+    def _without_walls(self, links: Links) -> Links:
+        """Drop the links through sides that no pressure acts on: those faces are just as open as they are."""
+        keep = np.ones(len(links.axis), dtype=bool)
+        for a, kind in enumerate(self._sides):
+            beyond = np.flatnonzero((links.axis == a) & ((links.below < 0) | (links.above < 0)))
+            keep[beyond] = kind.reshape(-1)[links.face[beyond]] == kinds.OPEN
+        return Links(*(getattr(links, f.name)[keep] for f in fields(links)))
+
+    def _kinds(self, openness: list[np.ndarray], split: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the kinds of cells and faces. Collective."""
+        grid, surroundings = self.grid, self.surroundings
+        face_kind = []
+        for a in range(grid.dim):
+            kind = np.zeros(grid.shape(a), dtype=np.uint8)
+            _face_kinds(surroundings.cell_kind, surroundings.side_kind[a], openness[a], kinds.STEP[a], kind)
+            kind.reshape(-1)[split[a]] = kinds.SPLIT
+            grid.exchange_faces(a, kind)
+            face_kind.append(kind)
+        cell_kind = surroundings.cell_kind.copy()
+        _cell_kinds(*three(face_kind), grid.dim == 2, cell_kind)
+        grid.exchange_cells(cell_kind)
+        if hasattr(self, "covered"):
+            cell_kind[(cell_kind == kinds.SOLID) & self.covered] = kinds.OBSTACLE
+        return cell_kind, face_kind
+
+    def _number(self, found, links: Links) -> tuple[Layout, np.ndarray, Extras | None, np.ndarray]:
+        """Return layout, cell numbers, extras, and the global number of each slot. Collective."""
+        grid, comm = self.grid, self.grid.comm
+        n_extra = comm.allreduce(len(found.extra_cell), op=MPI.MAX)
+        if n_extra == 0 and comm.allreduce(bool(links.split.any()), op=MPI.LOR) is False:
+            index = grid.index
+            return grid.layout, index, None, index.reshape(-1)[self._flat]
+        local = self._flat[found.extra_cell]
+        owned = np.zeros(grid.shape(None), dtype=bool)
+        owned[grid.owned(None)] = True
+        mine = np.flatnonzero(owned.reshape(-1)[local])
+        layout = Layout.of(comm, grid.layout.n_local + len(mine))
+        index = np.full(grid.shape(None), -1, dtype=IntType)
+        grid.from_vec(layout.start + np.arange(grid.layout.n_local, dtype=IntType), index)
+        grid.exchange_cells(index)
+        # whose ghost cell is split finds the owner's number by the cell's and the piece's
+        key = np.stack((index.reshape(-1)[local], found.extra_piece), axis=1).astype(np.int64)
+        numbers = layout.start + grid.layout.n_local + np.arange(len(mine))
+        table = dict(
+            (tuple(k), n)
+            for keys, values in comm.allgather((key[mine].tolist(), numbers.tolist()))
+            for k, n in zip(keys, values, strict=True)
+        )
+        extra = np.array([table[tuple(k)] for k in key.tolist()], dtype=np.int64)
+        slots = np.concatenate((index.reshape(-1)[self._flat].astype(np.int64), extra))
+        torn = np.flatnonzero(links.split)
+        below, above = (np.where(s[torn] >= 0, slots[s[torn]], -1) for s in (links.below, links.above))
+        here = [(n >= layout.start) & (n < layout.end) for n in (below, above)]
+        use = np.flatnonzero(here[0] | here[1])
+        face = np.empty(len(torn), dtype=np.int64)
+        for a in range(grid.dim):
+            at = links.axis[torn] == a
+            face[at] = self._flat_faces[a][links.face[torn[at]]]
+        order = use[np.lexsort((above[use], below[use], face[use], links.axis[torn[use]]))]
+        return (
+            layout,
+            index,
+            Extras(
+                local[mine],
+                found.extra_piece[mine],
+                found.extra_volume[mine],
+                links.axis[torn[order]],
+                face[order],
+                below[order],
+                above[order],
+                links.openness[torn[order]],
+            ),
+            slots,
+        )
+
+
+@njit(cache=True)
+def _face_kinds(cell_kind, side_kind, openness, step, face_kind):
+    """Write the kind of every local face whose two cells are local, too, but for SPLIT ones."""
+    di, dj, dk = step
+    n0, n1, n2 = cell_kind.shape
+    for i in range(di, n0):
+        for j in range(dj, n1):
+            for k in range(dk, n2):
+                if openness[i, j, k] == 0.0:
+                    continue
+                below = cell_kind[i - di, j - dj, k - dk] == kinds.OUTSIDE
+                above = cell_kind[i, j, k] == kinds.OUTSIDE
+                if below and above:
+                    continue
+                face_kind[i, j, k] = side_kind[i, j, k] if below or above else kinds.PRESSURE
+
+
+@njit(cache=True)
+def _cell_kinds(kind0, kind1, kind2, flat, cell_kind):
+    """Turn cells of the domain without any open face into SOLID."""
+    n0, n1, n2 = cell_kind.shape
+    for i in range(n0):
+        for j in range(n1):
+            for k in range(n2):
+                if cell_kind[i, j, k] == kinds.OUTSIDE:
+                    continue
+                shut = _shut(kind0[i, j, k]) and _shut(kind0[i + 1, j, k])
+                shut = shut and _shut(kind1[i, j, k]) and _shut(kind1[i, j + 1, k])
+                shut = shut and (flat or (_shut(kind2[i, j, k]) and _shut(kind2[i, j, k + 1])))
+                cell_kind[i, j, k] = kinds.SOLID if shut else kinds.FLUID
+
+
+@njit(cache=True)
+def _shut(kind):
+    return kind == kinds.DEAD or kind == kinds.WALL

@@ -1,0 +1,160 @@
+"""The unknowns of cells that hold several pieces of fluid, and the links of their faces: matrix, fluxes, velocities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import coo_matrix, csr_matrix
+
+from petfsi.fields.mac.grid import MacGrid
+from petfsi.fields.mac.pressure import POCKET_DIAGONAL, Pattern
+from petfsi.petsc import IntType, Layout
+
+
+@dataclass(frozen=True)
+class Extras:
+    """The second and further unknowns of split cells, which follow a rank's cells in the layout, and their links.
+
+    Attributes
+    ----------
+    cell : ndarray of int, shape (n_owned,)
+        Flat index in the local array of the cell that each of this rank's extra unknowns lies in.
+    piece : ndarray of int, shape (n_owned,)
+        Which piece of fluid of its cell it is: 1, 2, ...
+    volume : ndarray, shape (n_owned,)
+        Part of the cell's volume.
+    axis, face : ndarray of int, shape (n_links,)
+        Faces of split cells that touch this rank's unknowns: flat index in the local face array.
+    below, above : ndarray of int, shape (n_links,)
+        Global numbers of the unknowns that a part of the face joins; -1 beyond a side.
+    openness : ndarray, shape (n_links,)
+        That of the part, see ``cut``.
+    """
+
+    cell: np.ndarray
+    piece: np.ndarray
+    volume: np.ndarray
+    axis: np.ndarray
+    face: np.ndarray
+    below: np.ndarray
+    above: np.ndarray
+    openness: np.ndarray
+
+    def same(self, other: Extras | None) -> bool:
+        """Return whether unknowns and links are those of another one, whatever their openness."""
+        if other is None:
+            return False
+        names = ("cell", "piece", "axis", "face", "below", "above")
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    # ---- the system -----------------------------------------------------------------------------------------
+
+    def block(
+        self, pattern: Pattern, values: np.ndarray, layout: Layout, index: np.ndarray, grid: MacGrid, c: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return this rank's rows of L: those of the grid, given by their values, and what links add.
+
+        Parameters
+        ----------
+        pattern, values : Pattern, ndarray
+            Rows of the cells, in the grid's own numbers.
+        layout, index : Layout, ndarray
+            The unknowns, and their numbers by local cell.
+        grid : MacGrid
+        c : ndarray, shape (dim,)
+            dt/rho * area / dx per axis.
+
+        Returns
+        -------
+        indptr, indices, values : ndarray
+            Global columns, sorted.
+        """
+        # pattern's columns are numbers in the grid's layout; find the cells they mean
+        cells = np.flatnonzero(grid.index.reshape(-1) >= 0)
+        old = grid.index.reshape(-1)[cells]
+        order = np.argsort(old, kind="stable")
+        columns = index.reshape(-1)[cells[order]][np.searchsorted(old[order], pattern.indices)]
+        n_cells, n_rows = grid.layout.n_local, layout.n_local
+        indptr = np.concatenate((pattern.indptr, np.full(n_rows - n_cells, pattern.indptr[-1])))
+        shape = (n_rows, layout.n_global)
+        rows = csr_matrix((values, columns, indptr), shape=shape)
+        weight = c[self.axis] * self.openness
+        gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
+        i, j, v = [], [], []
+        for one, other in ((self.below, self.above), (self.above, self.below)):
+            mine = (one >= layout.start) & (one < layout.end)
+            i.append(one[mine] - layout.start)
+            j.append(one[mine])
+            v.append((gain * weight)[mine])
+            mine &= other >= 0
+            i.append(one[mine] - layout.start)
+            j.append(other[mine])
+            v.append(-weight[mine])
+        extra = np.arange(n_cells, n_rows)
+        i.append(extra)
+        j.append(extra + layout.start)
+        v.append(np.full(len(extra), POCKET_DIAGONAL * 2.0 * c.sum()))
+        added = coo_matrix((np.concatenate(v), (np.concatenate(i), np.concatenate(j))), shape=shape)
+        total = (rows + added.tocsr()).tocsr()
+        total.sort_indices()
+        return total.indptr.astype(IntType), total.indices.astype(IntType), total.data
+
+    def add_inflow(self, star: list[np.ndarray], areas: np.ndarray, layout: Layout, out: np.ndarray) -> None:
+        """Add minus the net outflow through the links to this rank's right-hand side."""
+        v = self.at_faces(star)
+        flux = areas[self.axis] * self.openness * v
+        for number, sign in ((self.below, -1.0), (self.above, 1.0)):
+            mine = (number >= layout.start) & (number < layout.end)
+            np.add.at(out, number[mine] - layout.start, sign * flux[mine])
+
+    def at_faces(self, arrays: list[np.ndarray]) -> np.ndarray:
+        """Return a face quantity at each link."""
+        values = np.zeros(len(self.axis))
+        for a, array in enumerate(arrays):
+            at = self.axis == a
+            values[at] = array.reshape(-1)[self.face[at]]
+        return values
+
+    def project(
+        self, star: list[np.ndarray], p: np.ndarray, start: int, pressure: np.ndarray, index: np.ndarray,
+        factor: np.ndarray, out: list[np.ndarray], comm: MPI.Comm,
+    ) -> None:  # fmt: skip
+        """Write the velocity of this rank's split faces: the mean over their parts. Collective.
+
+        Parameters
+        ----------
+        star, out : list of ndarray
+            Face arrays before and after.
+        p : ndarray
+            This rank's extra pressures, whose first has the global number ``start``.
+        pressure, index : ndarray
+            Cell arrays, ghosts valid: pressure, and the unknowns' numbers.
+        factor : ndarray, shape (dim,)
+            dt / (rho dx) per axis.
+        """
+        parts = comm.allgather((start, p))
+        numbers = np.concatenate([s + np.arange(len(q)) for s, q in parts])
+        every = np.concatenate([q for _, q in parts])
+        ends = []
+        for number, step in ((self.below, -1), (self.above, 0)):
+            value = np.zeros(len(number))
+            for a, array in enumerate(out):
+                at = np.flatnonzero((self.axis == a) & (number >= 0))
+                where = list(np.unravel_index(self.face[at], array.shape))
+                where[a] = where[a] + step
+                own = index[tuple(where)] == number[at]
+                value[at] = pressure[tuple(where)]
+                far = at[~own]
+                value[far] = every[np.searchsorted(numbers, number[far])]
+            ends.append(value)
+        gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
+        v = self.at_faces(star) - gain * factor[self.axis] * (ends[1] - ends[0])
+        for a, array in enumerate(out):
+            at = self.axis == a
+            flat = array.reshape(-1)
+            weight = np.bincount(self.face[at], self.openness[at], minlength=flat.size)
+            total = np.bincount(self.face[at], self.openness[at] * v[at], minlength=flat.size)
+            faces = np.unique(self.face[at])
+            flat[faces] = total[faces] / weight[faces]

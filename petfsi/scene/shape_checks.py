@@ -1,0 +1,168 @@
+"""What shapes and sizes must keep; each check yields the mistakes it finds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from petfsi.scene.mistakes import ABSENT, Problem
+from petfsi.scene.schema import Box, Fluid, Shape
+
+#: PETSc numbers unknowns with 32 bits.
+MAX_CELLS = 2**31 - 1
+#: Bodies may touch the grid's sides and each other; this fraction of a length is round-off.
+SLACK = 1e-9
+
+Problems = Iterator[Problem]
+
+
+def length(key: str, value: Sequence | None, dim: int) -> Problems:
+    """Judge whether a list has an item per axis."""
+    if value is not None and len(value) != dim:
+        yield Problem(key, value, f"must have {dim} items, as dim = {dim}", ("dim",))
+
+
+def sizes(key: str, box: Box | Fluid, dim: int) -> Problems:
+    """Judge a box, or what the fluid has of one."""
+    yield from length(f"{key}.origin", box.origin, dim)
+    yield from length(f"{key}.size", box.size, dim)
+    yield from length(f"{key}.cells", box.cells, dim)
+    if min(box.size, default=1.0) <= 0:
+        yield Problem(f"{key}.size", box.size, "must be greater than 0 along every axis (m)")
+    if box.cells is not None and math.prod(box.cells) > MAX_CELLS:
+        yield Problem(f"{key}.cells", box.cells, f"make more than {MAX_CELLS} cells, the most that can be numbered")
+
+
+def is_measured(box: Box | Fluid, dim: int) -> bool:
+    """Whether a box is sound enough to compare places with it."""
+    return len(box.origin) == len(box.size) == dim and min(box.size) > 0
+
+
+def _shape(key: str, shape: Shape, dim: int) -> Problems:
+    """Judge what any shape must keep, wherever it stands."""
+    kinds = shape.kinds
+    if len(kinds) != 1:
+        found = ", ".join(kinds) or ABSENT
+        yield Problem(key, found, "must have exactly one of box, ball, cylinder, halfspace, mesh")
+    if shape.box is not None:
+        yield from sizes(f"{key}.box", shape.box, dim)
+    if shape.ball is not None:
+        yield from length(f"{key}.ball.centre", shape.ball.centre, dim)
+    if shape.cylinder is not None:
+        yield from _cylinder(f"{key}.cylinder", shape, dim)
+    if shape.halfspace is not None:
+        yield from length(f"{key}.halfspace.point", shape.halfspace.point, dim)
+        yield from length(f"{key}.halfspace.normal", shape.halfspace.normal, dim)
+        if not any(shape.halfspace.normal):
+            yield Problem(f"{key}.halfspace.normal", shape.halfspace.normal, "must not be zero")
+    yield from length(f"{key}.translate", shape.translate, dim)
+    for name in ("scale", "translate"):
+        if shape.mesh is None and name in shape.model_fields_set and getattr(shape, name) not in (1.0, None):
+            yield Problem(f"{key}.{name}", getattr(shape, name), "belongs to a mesh file only", (f"{key}.mesh",))
+
+
+def _cylinder(key: str, shape: Shape, dim: int) -> Problems:
+    cylinder = shape.cylinder
+    assert cylinder is not None
+    if dim == 2:
+        yield Problem(key, ABSENT, "a cylinder needs dim = 3; in 2D use ball, a disk", ("dim",))
+        return
+    yield from length(f"{key}.start", cylinder.start, dim)
+    yield from length(f"{key}.end", cylinder.end, dim)
+    if cylinder.start == cylinder.end:
+        yield Problem(f"{key}.end", cylinder.end, "must differ from start")
+
+
+def plain_shape(key: str, shape: Shape, dim: int) -> Problems:
+    """Judge a shape that is never meshed."""
+    yield from _shape(key, shape, dim)
+    for kind in ("box", "ball"):
+        cells = getattr(getattr(shape, kind), "cells", None)
+        if cells is not None:
+            yield Problem(f"{key}.{kind}.cells", cells, f"only a solid's {kind} is meshed; leave cells out")
+    if shape.cavity is not None:
+        yield Problem(f"{key}.cavity", ABSENT, "only a solid's box can have a cavity")
+
+
+def analytic_shape(key: str, shape: Shape, dim: int) -> Problems:
+    """Judge a shape that picks out points."""
+    yield from plain_shape(key, shape, dim)
+    if shape.mesh is not None:
+        yield Problem(f"{key}.mesh", shape.mesh, "must be a box, ball, cylinder or halfspace here")
+
+
+def solid_shape(key: str, shape: Shape, dim: int) -> Problems:
+    """Judge a shape that must be meshed."""
+    yield from _shape(key, shape, dim)
+    for kind in ("cylinder", "halfspace"):
+        if getattr(shape, kind) is not None:
+            allowed = "a solid must be meshed: give a box or a ball with cells, or a mesh file"
+            yield Problem(f"{key}.{kind}", ABSENT, allowed)
+    if shape.box is not None and shape.box.cells is None:
+        yield Problem(f"{key}.box.cells", ABSENT, "is missing; a solid's box needs its number of cells per axis")
+    if shape.ball is not None and shape.ball.cells is None:
+        yield Problem(f"{key}.ball.cells", ABSENT, "is missing; a solid's ball needs its number of cells across")
+    if shape.ball is not None and (shape.ball.cells or 0) ** dim > MAX_CELLS:
+        allowed = f"make more than {MAX_CELLS} cells, the most that can be numbered"
+        yield Problem(f"{key}.ball.cells", shape.ball.cells, allowed)
+    if shape.cavity is not None:
+        yield from _cavity(key, shape, dim)
+
+
+def _cavity(key: str, shape: Shape, dim: int) -> Problems:
+    box, cavity = shape.box, shape.cavity
+    assert cavity is not None
+    if box is None:
+        yield Problem(f"{key}.cavity", ABSENT, "belongs to a meshed box only", (f"{key}.box",))
+        return
+    yield from sizes(f"{key}.cavity", cavity, dim)
+    if cavity.cells is not None:
+        yield Problem(f"{key}.cavity.cells", cavity.cells, "a cavity has the cells of its box; leave cells out")
+    if not (is_measured(box, dim) and is_measured(cavity, dim) and len(box.cells or ()) == dim):
+        return
+    taken = [_cells_within(box, cavity, axis) for axis in range(dim)]
+    if not all(taken):
+        yield Problem(f"{key}.cavity", ABSENT, "holds no cell's centre, so nothing is left out", (f"{key}.box",))
+    elif taken == box.cells:
+        yield Problem(f"{key}.cavity", ABSENT, "holds every cell's centre, so nothing is left", (f"{key}.box",))
+
+
+def _cells_within(box: Box, cavity: Box, axis: int) -> int:
+    """Return how many of the box's cells have their centre in the cavity, along one axis."""
+    assert box.cells is not None
+    n, low, size = box.cells[axis], cavity.origin[axis], cavity.size[axis]
+    centres = box.origin[axis] + box.size[axis] * (np.arange(n) + 0.5) / n
+    return int(np.count_nonzero((centres >= low) & (centres <= low + size)))
+
+
+def extent(shape: Shape, dim: int) -> tuple[list[float], list[float]] | None:
+    """Return the lower and upper corner of a box or ball that is sound; None of all other shapes."""
+    box, ball = shape.box, shape.ball
+    if box is not None and is_measured(box, dim):
+        return box.origin, [o + s for o, s in zip(box.origin, box.size, strict=True)]
+    if ball is not None and len(ball.centre) == dim:
+        return [c - ball.radius for c in ball.centre], [c + ball.radius for c in ball.centre]
+    return None
+
+
+def overlap(a: Shape, b: Shape, dim: int) -> bool:
+    """Whether two shapes, boxes or balls, share more than round-off.
+
+    A ball is a point, a box itself; what is left between the two must be longer than the radii together.
+    """
+    (low_a, high_a), (low_b, high_b) = (_core(shape, dim) for shape in (a, b))
+    reach = sum(shape.ball.radius for shape in (a, b) if shape.ball is not None)
+    gaps = np.maximum(low_b - high_a, low_a - high_b)
+    if reach == 0:
+        return bool(np.all(gaps < -SLACK * np.maximum(high_a - low_a, high_b - low_b)))
+    return bool(np.linalg.norm(np.maximum(gaps, 0.0)) < (1 - SLACK) * reach)
+
+
+def _core(shape: Shape, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a box, or the centre of a ball twice."""
+    corners = extent(shape, dim)
+    assert corners is not None
+    low, high = (np.array(corner) for corner in corners)
+    return (low, high) if shape.ball is None else (0.5 * (low + high), 0.5 * (low + high))
