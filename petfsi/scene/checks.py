@@ -27,6 +27,7 @@ from petfsi.scene.shape_checks import (
     sizes,
     solid_shape,
 )
+from petfsi.scene.stepping import Stepping
 
 MAX_STEPS = 10**8
 
@@ -77,10 +78,16 @@ def _names(scene: Scene) -> Problems:
 
 def _time(scene: Scene) -> Problems:
     time = scene.time
-    if time.dt > time.end:
+    try:
+        stepping = Stepping(time)
+        dt = stepping.length(0.0)
+    except ExpressionError as error:
+        yield Problem("time.dt", time.dt, error.reason, ("time.end",))
+        return
+    if dt > time.end:
         yield Problem("time.dt", time.dt, f"must not exceed time.end = {time.end:g} s", ("time.end",))
-    elif not time.end / time.dt <= MAX_STEPS:
-        allowed = f"makes {time.end / time.dt:.3g} steps to time.end = {time.end:g} s; at most {MAX_STEPS:.0e} may be"
+    elif stepping.constant and not time.end / dt <= MAX_STEPS:
+        allowed = f"makes {time.end / dt:.3g} steps to time.end = {time.end:g} s; at most {MAX_STEPS:.0e} may be"
         yield Problem("time.dt", time.dt, allowed, ("time.end",))
 
 

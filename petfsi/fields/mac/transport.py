@@ -153,10 +153,6 @@ class Transport:
         """Return how long after the step's begin v_w holds, s."""
         return self.integrator.moment(dt)
 
-    def solved(self, velocity: Faces) -> Faces:
-        """Return v_w of the last step, which has no divergence, given the velocity at its end."""
-        return velocity
-
     def half_way(self, velocity: Faces, dt: float) -> Faces:
         """Return the flow that carries from the step's begin to its end, given that at its begin."""
         return velocity
@@ -269,10 +265,6 @@ class MidpointTransport(Transport):
         self.scheme = self.integrator = Midpoint()
         self._carried: Faces = []
 
-    def solved(self, velocity: Faces) -> Faces:
-        """Return the velocity in the middle of the last step."""
-        return self.past["velocity_middle"] if self.past_dt else velocity
-
     def half_way(self, velocity: Faces, dt: float) -> Faces:
         """Return the velocity in the middle of the coming step."""
         return self._at(velocity, dt / 2)
@@ -295,7 +287,8 @@ class MidpointTransport(Transport):
         self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
     ) -> Faces:
         """Return the velocity at the step's end. Collective."""
-        pairs = zip(solved, self.solved(velocity), strict=True)
+        middle = self.past["velocity_middle"] if self.past_dt else velocity
+        pairs = zip(solved, middle, strict=True)
         ahead = [self.scheme.ahead(w, before, dt, self.past_dt) for w, before in pairs]
         complete(ahead)
         given = [(k == kinds.WALL) | (k == kinds.SOLID_FACE) for k in kind]
