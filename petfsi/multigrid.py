@@ -26,6 +26,7 @@ from petsc4py import PETSc
 
 from petfsi.errors import InputError
 from petfsi.petsc import IntType, Layout
+from petfsi.smoothers import Walls
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.fluid import MacFluid
@@ -230,6 +231,7 @@ class Multigrid:
         self._galerkin = options.getString("pc_mg_galerkin", "none") not in ("none", "external")
         self._fluxes: list[PETSc.Mat] = []
         self._operators: list[PETSc.Mat] = []
+        self._read = False
         self._pc, self._fine = pc, fine
         pc.setMGLevels(levels)
         for n, transfer in enumerate(self.transfers):
@@ -238,10 +240,11 @@ class Multigrid:
     def refresh(self, fluxes: PETSc.Mat, walls: PETSc.Mat | None) -> None:
         """Make the coarse operators of L and E, anew or in place. Collective."""
         if self._galerkin:
+            self._tell(len(self.transfers), (fluxes, walls))
             return
         first = not self._fluxes
         levels = len(self.transfers) + 1
-        operators = []
+        operators, parts = [], [(fluxes, walls)]
         for n, transfer in enumerate(self.transfers):
             carry = transfer.constant if transfer.regular else transfer.linear
             fluxes = _carried(fluxes, carry, None if first else self._fluxes[n])
@@ -255,12 +258,27 @@ class Multigrid:
                 operator = fluxes.copy()
                 operator.axpy(1.0, walls, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             operators.append(operator)
+            parts.append((fluxes, walls))
         for n, operator in enumerate(operators):
             level = levels - 2 - n
             solver = self._pc.getMGSmoother(level) if level else self._pc.getMGCoarseSolve()
             solver.setOperators(operator, operator)
         self._pc.getMGSmoother(levels - 1).setOperators(self._fine, self._fine)
-        self._operators = operators
+        for n, part in enumerate(parts[: levels - 1]):
+            self._tell(levels - 1 - n, part)
+        self._operators, self._read = operators, True
+
+    def _tell(self, level: int, parts: tuple[PETSc.Mat, PETSc.Mat | None]) -> None:
+        """Give the smoother of a level the two parts of its operator, if it cares."""
+        solver = self._pc.getMGSmoother(level)
+        if not self._read:
+            solver.setFromOptions()
+        pc = solver.getPC()
+        if pc.getType() == PETSc.PC.Type.PYTHON:
+            # not by the option pc_python_type: such a context outlives Python and crashes PETSc's end
+            if pc.getPythonContext() is None:
+                pc.setPythonContext(Walls())
+            pc.getPythonContext().parts = parts
 
 
 def _carried(fine: PETSc.Mat, transfer: PETSc.Mat, result: PETSc.Mat | None) -> PETSc.Mat:

@@ -37,7 +37,9 @@ class PressureSolver:
         options = PETSc.Options(outer.getOptionsPrefix())
         self.eliminates = bool(system.index_sets) and options.getString("pc_fieldsplit_type", "") == "schur"
         if self.eliminates and options.getString("pc_fieldsplit_schur_precondition", "a11") == "user":
-            self.stand_in = SchurStandIn(system)
+            own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
+            grids = own.getString("pc_type", "") == PETSc.PC.Type.MG
+            self.stand_in = SchurStandIn(system, assembled=own.getBool("schur_assembled", not grids))
             outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
 
     def connect(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
@@ -77,6 +79,10 @@ class PressureSolver:
             schur = self._ksp.getOperators()[0]
             schur.setNullSpace(self.fluid.block.getNullSpace())
             schur.setTransposeNullSpace(self.fluid.block.getNullSpace())
+
+    def release(self) -> None:
+        """Hold on to no solver any longer."""
+        self._ksp = self._multigrid = None
 
     def aim(self, residual: float) -> None:
         """Let the inner solver stop where the whole has the wanted residual, unless options say where."""

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from petsc4py import PETSc
 
+from petfsi import petsc
 from petfsi.petsc import IntType, Layout, new_block, set_csr
 from petfsi.system import System
 
@@ -18,46 +19,77 @@ from petfsi.system import System
 class SchurStandIn:
     """Sp of a system of one solid and one fluid, refreshed on demand.
 
+    Parameters
+    ----------
+    system : System
+    assembled : bool
+        Whether Sp is one AIJ matrix, as most preconditioners want it, or the unassembled sum of L and E, which costs
+        nothing to make.
+
     Attributes
     ----------
     operator : PETSc.Mat
-        Sp, AIJ; the same object for the whole life.
+        Sp; the same object for the whole life.
     walls : PETSc.Mat
-        E of the last refresh.
+        E; the same object, too.
     """
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, assembled: bool) -> None:
         solid, fluid = system.fields
         layout: Layout = fluid.layout
         self.solid_block, self.fluxes = solid.block, fluid.block
-        self.flux_block, self.force_block = (
-            system.operator.getNestSubMatrix(1, 0),
-            system.operator.getNestSubMatrix(0, 1),
-        )
-        self.operator = new_block(system.comm, layout, layout)
-        self.walls: PETSc.Mat | None = None
-        self._pattern: tuple[np.ndarray, np.ndarray] | None = None
+        self.flux_block = system.operator.getNestSubMatrix(1, 0)
+        self.force_block = system.operator.getNestSubMatrix(0, 1)
         self._comm = system.comm
-        self.refresh()
+        self._pattern: tuple[np.ndarray, np.ndarray] | None = None
+        self._walls_pattern: tuple[np.ndarray, np.ndarray] | None = None
+        self.walls = new_block(system.comm, layout, layout)
+        self._assembled = assembled
+        if assembled:
+            self.operator = new_block(system.comm, layout, layout)
+        self._fill_walls()
+        if not assembled:
+            self.operator = PETSc.Mat().create(system.comm)
+            self.operator.setSizes((layout.sizes, layout.sizes))
+            self.operator.setType(PETSc.Mat.Type.COMPOSITE)
+            petsc.add_to_composite(self.operator, self.fluxes)
+            petsc.add_to_composite(self.operator, self.walls)
+        self._fill_operator()
 
-    def refresh(self) -> bool:
-        """Compute E and Sp from the present blocks; return whether the pattern changed. Collective."""
+    def refresh(self) -> None:
+        """Compute E and Sp from the present blocks. Collective."""
+        self._fill_walls()
+        self._fill_operator()
+
+    def _fill_walls(self) -> None:
         inverse = self.solid_block.getDiagonal()
         inverse.reciprocal()
         yielding = self.force_block.copy()
         yielding.diagonalScale(L=inverse)
-        if self.walls is not None:
-            self.walls.destroy()
-        self.walls = self.flux_block.matMult(yielding)
-        self.walls.scale(-1.0)
-        yielding.destroy()
-        indptr, indices, values = _sum(*self.fluxes.getValuesCSR(), *self.walls.getValuesCSR())
-        known = self._pattern
+        walls = self.flux_block.matMult(yielding)
+        walls.scale(-1.0)
+        rows = walls.getValuesCSR()
+        self._walls_pattern = self._set(self.walls, rows, self._walls_pattern)
+        for thing in (inverse, yielding, walls):
+            thing.destroy()
+
+    def _fill_operator(self) -> None:
+        if self._assembled:
+            rows = _sum(*self.fluxes.getValuesCSR(), *self.walls.getValuesCSR())
+            self._pattern = self._set(self.operator, rows, self._pattern)
+        else:
+            self.operator.assemble()
+
+    def _set(
+        self,
+        mat: PETSc.Mat,
+        rows: tuple[np.ndarray, np.ndarray, np.ndarray],
+        known: tuple[np.ndarray, np.ndarray] | None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        indptr, indices, values = rows
         new = known is None or not (np.array_equal(indptr, known[0]) and np.array_equal(indices, known[1]))
-        new = self._comm.allreduce(new) > 0
-        set_csr(self.operator, indptr, indices, values, new_pattern=new)
-        self._pattern = indptr, indices
-        return new
+        set_csr(mat, indptr, indices, values, new_pattern=self._comm.allreduce(new) > 0)
+        return indptr, indices
 
 
 def _sum(

@@ -6,6 +6,7 @@ import sysconfig
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from weakref import finalize
 
 import numpy as np
 from petsc4py import PETSc
@@ -143,6 +144,8 @@ class Solver:
         try:
             if self._ksp is None:
                 self._ksp = self._create()
+                # what PETSc runs in Python must be gone before Python is
+                self._release = finalize(self, _release, self._ksp, self._pressure)
             elif self.converts:
                 self._ksp.setOperators(self._convert())
             elif self._pressure is not None:
@@ -197,7 +200,7 @@ class Solver:
     def reset(self) -> None:
         """Forget everything but the options, so that the next solve is that of a fresh process. Collective."""
         if self._ksp is not None:
-            self._ksp.destroy()
+            self._release()
             self._ksp = self._pressure = None
 
     def adopt(self, system: System) -> None:
@@ -289,6 +292,12 @@ class Solver:
                 lines.append(f"option -{name}: no solver of this scene reads it{hint}")
             raise InputError("\n".join(lines))
         return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
+
+
+def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
+    if pressure is not None:
+        pressure.release()
+    ksp.destroy()
 
 
 #: How the names of options end that mean nothing without a value.
