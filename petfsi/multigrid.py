@@ -3,10 +3,9 @@
 Cells are merged by twos along every axis. With Q the piecewise constant and P the (bi-, tri-) linear interpolation
 between cell centres, level by level,
 
-    corrections   x += P x_c ,                                      P handed to PCMG,
-    fluxes        L_c = Q^T L Q / 2 :                               the open parts of the faces are averaged, and the
-                                                                    distance between centres doubles,
-    walls         E_c = Q^T E Q :                                   what moving walls let through (see ``schur``) adds up.
+    corrections   x += P x_c             with P handed to PCMG,
+    fluxes        L_c = Q^T L Q / 2      open parts of faces are averaged, the distance between centres doubles,
+    walls         E_c = Q^T E Q          what moving walls let through (see ``schur``) adds up.
 
 Coarse operators keep the 5 or 7 points of L, so they cost next to nothing to make and to apply, and the cycle is
 symmetric and positive whatever the geometry. Where only some axes can still be halved, L_c and E_c are P^T . P.

@@ -6,6 +6,7 @@ import sysconfig
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 from weakref import finalize
 
 import numpy as np
@@ -175,8 +176,8 @@ class Solver:
                 sub.setMonitor(self._count)
         return ksp
 
-    def _grids(self, fluid: FluidField) -> Hierarchy | None:
-        """Return the hierarchy of the fluid's grids, made once per run. Collective."""
+    def _grids(self, fluid: Any) -> Hierarchy | None:
+        """Return the hierarchy of the fluid's grids, made once per run; None if it has no grid. Collective."""
         if getattr(fluid, "grid", None) is not None:
             if self._hierarchy is None:
                 self._hierarchy = Hierarchy(fluid)
