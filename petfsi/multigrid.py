@@ -227,7 +227,7 @@ class Multigrid:
             name = f"-{pc.getOptionsPrefix()}pc_mg_levels"
             raise InputError(f"option {name} {levels}: must be from 1 to {available} for this grid")
         self.transfers = hierarchy.transfers[: levels - 1]
-        self._galerkin = options.getString("pc_mg_galerkin", "none") not in ("none", "external")
+        self._galerkin = options.getString("pc_mg_galerkin", "none") != "none"
         self._fluxes: list[PETSc.Mat] = []
         self._operators: list[PETSc.Mat] = []
         self._read = False
@@ -239,7 +239,9 @@ class Multigrid:
     def refresh(self, fluxes: PETSc.Mat, walls: PETSc.Mat | None) -> None:
         """Make the coarse operators of L and E, anew or in place. Collective."""
         if self._galerkin:
-            self._tell(len(self.transfers), (fluxes, walls))
+            for level in range(1, len(self.transfers) + 1):  # of the coarse ones nobody knows the parts
+                self._tell(level, (fluxes, walls) if level == len(self.transfers) else (None, None))
+            self._read = True
             return
         first = not self._fluxes
         levels = len(self.transfers) + 1
@@ -267,7 +269,7 @@ class Multigrid:
             self._tell(levels - 1 - n, part)
         self._operators, self._read = operators, True
 
-    def _tell(self, level: int, parts: tuple[PETSc.Mat, PETSc.Mat | None]) -> None:
+    def _tell(self, level: int, parts: tuple[PETSc.Mat | None, PETSc.Mat | None]) -> None:
         """Give the smoother of a level the two parts of its operator, if it cares."""
         solver = self._pc.getMGSmoother(level)
         if not self._read:

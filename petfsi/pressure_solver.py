@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.base import FluidField
+from petfsi.fields.base import FluidField, SolidField
+from petfsi.modes import DEGREE, LIGHT, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
 from petfsi.schur import SchurStandIn
 from petfsi.system import System
 
+#: A preconditioner is kept while no diagonal entry has changed by more than this part, and the iterations have not
+#: grown by this factor.
+CHANGE, GROWTH = 0.05, 1.2
 #: The inner solver stops at this part of the residual that the whole system may have.
 SHARE = 0.5
 
@@ -34,12 +40,17 @@ class PressureSolver:
         self.stand_in: SchurStandIn | None = None
         self._multigrid: Multigrid | None = None
         self._ksp: PETSc.KSP | None = None
+        self._has_modes = False
+        self._built: np.ndarray | None = None
+        self._versions: list[int] = []
+        self._first_iterations = 0
         options = PETSc.Options(outer.getOptionsPrefix())
         self.eliminates = bool(system.index_sets) and options.getString("pc_fieldsplit_type", "") == "schur"
         if self.eliminates and options.getString("pc_fieldsplit_schur_precondition", "a11") == "user":
             own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
             grids = own.getString("pc_type", "") == PETSc.PC.Type.MG
-            self.stand_in = SchurStandIn(system, assembled=own.getBool("schur_assembled", not grids))
+            sums = grids and own.getString("pc_mg_galerkin", "none") == "none"
+            self.stand_in = SchurStandIn(system, assembled=own.getBool("schur_assembled", not sums))
             outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
 
     def connect(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
@@ -62,18 +73,66 @@ class PressureSolver:
             fine = self.stand_in.operator if self.stand_in is not None else self.fluid.block
             self._multigrid = Multigrid(pc, hierarchy, fine)
         self._pass_on()
+        if self.stand_in is not None and self._symmetric():
+            self._add_modes(ksp)
+
+    def _add_modes(self, ksp: PETSc.KSP) -> None:
+        """Wrap the preconditioner if there are light bodies. Collective."""
+        own = PETSc.Options(ksp.getOptionsPrefix())
+        degree = own.getInt("modes_degree", DEGREE)
+        light = own.getReal("modes_below", LIGHT) * self.fluid.density
+        solid = self.system.fields[0]
+        assert isinstance(solid, SolidField)
+        if degree < 0 or not len(solid.light_motions(degree, light, MOST)):
+            return
+        wrapped = PETSc.PC().create(self.system.comm)
+        wrapped.setType(PETSc.PC.Type.PYTHON)
+        wrapped.setPythonContext(Modes(ksp.getPC(), self.system, degree, light))
+        wrapped.setOperators(*ksp.getOperators())
+        ksp.setPC(wrapped)
+        self._has_modes = True
 
     def _symmetric(self) -> bool:
         return all(coupling.symmetric for coupling in self.system.couplings)
 
-    def refresh(self) -> None:
-        """Follow the operator's new values. Collective."""
-        if self.stand_in is not None:
-            self.stand_in.refresh()
-        self._pass_on()
+    def refresh(self, iterations: int) -> None:
+        """Follow the operator's new values, unless the preconditioner there is good enough. Collective.
 
-    def _pass_on(self) -> None:
-        if self._multigrid is not None:
+        Parameters
+        ----------
+        iterations : int
+            Of the last solve.
+        """
+        stale = self._is_stale(iterations)
+        if stale and self.stand_in is not None:
+            self.stand_in.refresh()
+        self._pass_on(stale)
+
+    def _is_stale(self, iterations: int) -> bool:
+        """Return whether the last preconditioner no longer pays. Collective.
+
+        It is kept while no pattern has changed, no diagonal entry by more than ``lag_change`` of itself, and the
+        iterations have not grown by ``lag_growth`` over those of the first solve with it.
+        """
+        if self.stand_in is None or self._ksp is None or self._has_modes:
+            return True
+        own = PETSc.Options(self._ksp.getOptionsPrefix())
+        change, growth = own.getReal("lag_change", CHANGE), own.getReal("lag_growth", GROWTH)
+        if change <= 0:
+            return True
+        versions = [coupling.pattern_version for coupling in self.system.couplings]
+        self._first_iterations = self._first_iterations or iterations
+        now = np.concatenate([field.block.getDiagonal().array_r for field in self.system.fields])
+        stale = versions != self._versions or iterations > growth * self._first_iterations
+        if self._built is not None:
+            stale = stale or bool(np.any(np.abs(now - self._built) > change * np.abs(self._built)))
+        if self.system.comm.allreduce(stale, MPI.LOR):
+            self._built, self._versions, self._first_iterations = now, versions, 0
+            return True
+        return False
+
+    def _pass_on(self, stale: bool = True) -> None:
+        if stale and self._multigrid is not None:
             self._multigrid.refresh(self.fluid.block, self.stand_in.walls if self.stand_in is not None else None)
         if self.eliminates and self._ksp is not None:
             schur = self._ksp.getOperators()[0]

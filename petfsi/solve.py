@@ -150,7 +150,7 @@ class Solver:
             elif self.converts:
                 self._ksp.setOperators(self._convert())
             elif self._pressure is not None:
-                self._pressure.refresh()
+                self._pressure.refresh(self._inner_iterations)
             self._ksp.setUp()
         except PETSc.Error as error:
             raise InputError(_option_story(self.prefix, error)) from None
