@@ -666,8 +666,12 @@ def test_a_step_that_shrinks_to_nothing_is_told():
 def test_a_mesh_outside_the_grid_is_refused():
     scene = scene_from_dict(layer())
     check_inside_grid(scene, "solids.bunny.shape", np.array([[0.0, 0.0], [1.0 + 1e-12, 2.0]]))
-    with pytest.raises(InputError, match=r'solids.bunny.shape = "y from 0.5 to 2.5 m": y must lie inside'):
-        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, 2.5]]))
+    with pytest.raises(InputError, match=r'solids.bunny.shape = "y from -0.5 to 0.5 m": y must lie inside'):
+        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, -0.5]]))
+    # the top is open: a solid may float there, but not lie beyond it
+    check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, 2.5]]))
+    with pytest.raises(InputError, match=r'"y from 2.1 to 2.5 m": y must lie inside'):
+        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 2.1], [0.5, 2.5]]))
     dry = without(layer(), "fluid", "obstacles", "probes.gauge")
     check_inside_grid(scene_from_dict(dry), "solids.bunny.shape", np.array([[9.0, 9.0]]))
 

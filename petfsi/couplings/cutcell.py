@@ -88,8 +88,9 @@ class CutCellCoupling(Coupling):
         columns = np.tile(np.arange(dim), points.size)
         by_point = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))
         force = (self._free_map.T @ by_point).tocoo()
-        rows = gather_triplets(self.comm, layout, self._free[force.row], force.col.astype(np.int64), force.data)
-        return csr_matrix((rows[2], rows[1], rows[0]), shape=(layout.n_local, dim))
+        columns = force.col.astype(np.int64)
+        indptr, indices, values = gather_triplets(self.comm, layout, self._free[force.row], columns, force.data)
+        return csr_matrix((values, indices, indptr), shape=(layout.n_local, dim))
 
     def assemble(self, time: float, dt: float) -> None:
         """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""

@@ -20,7 +20,7 @@ SAME = 1e-9
 
 
 class Box(NamedTuple):
-    """The box, with its margin, as the kernels see it.
+    """The part of the box that the surface reaches, with a margin of one cell.
 
     Attributes
     ----------
@@ -30,17 +30,21 @@ class Box(NamedTuple):
         With the margin.
     images : ndarray of int64, shape (k, dim)
         How far each image of the surface is moved, in cells.
+    box_lo, box_hi : ndarray of int64, shape (dim,)
+        The box.
     """
 
     lo: np.ndarray
     shape: np.ndarray
     images: np.ndarray
+    box_lo: np.ndarray
+    box_hi: np.ndarray
 
 
 class Pieces(NamedTuple):
-    """Pieces and links as in ``clipping.CutCells``, but cells and faces are numbered in the box with its margin.
+    """Pieces and links as in ``clipping.CutCells``, but cells are numbered in ``Box`` with its margin.
 
-    ``link_cell`` is the cell above the face. Above the box it lies in the margin.
+    ``link_cell`` is the cell above the face, which may lie in the margin.
     """
 
     patch_piece: np.ndarray
@@ -90,9 +94,9 @@ def find_pieces(
     split, patch_piece, extras = split_cells(
         x, facets, beyond, box, patches.facet, patches.image, patches.cell, parts, patches.vectors, ranges, openings
     )
-    place = np.column_stack(np.unravel_index(split.cell, box.shape)).reshape(-1, dim)
+    place = np.column_stack(np.unravel_index(split.cell, box.shape)).reshape(-1, dim) + box.lo
     stride = np.append(np.cumprod(box.shape[:0:-1])[::-1], 1)
-    links, link_open = link_pieces(split, stride, place == 1, place == box.shape - 2)
+    links, link_open = link_pieces(split, stride, place == box.box_lo, place == box.box_hi - 1)
     return Pieces(
         patch_piece,
         extras[:, 0].astype(np.int64),

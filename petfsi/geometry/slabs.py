@@ -106,15 +106,19 @@ def clip_segment(points, tags, axis, low, high, out, out_tags):
 
 @njit(cache=True)
 def slab_range(points, n, axis, lo, hi):
-    """Return the first slab and one past the last that n points reach, within [lo - 1, hi)."""
+    """Return the first slab and one past the last that n points reach, and whether it is one that holds them all.
+
+    The slabs are those from lo to below hi, and lo - 1 for all that lies below.
+    """
+    if n == 0:
+        return hi, hi, False
     low = high = points[0, axis]
     for i in range(1, n):
         low, high = min(low, points[i, axis]), max(high, points[i, axis])
-    if high < lo:
-        return lo - 1, lo
     if low >= hi:
-        return hi, hi
-    return int(max(math.floor(low), lo - 1)), int(min(math.floor(high), hi - 1)) + 1
+        return hi, hi, False
+    first, last = math.floor(max(low, lo - 1.0)), math.floor(max(min(high, hi - 1.0), lo - 1.0))
+    return int(first), int(last) + 1, first >= lo and high < first + 1.0
 
 
 @njit(cache=True)

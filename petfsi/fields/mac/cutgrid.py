@@ -199,8 +199,10 @@ class CutGrid:
         slots = np.concatenate((index.reshape(-1)[self._flat].astype(np.int64), extra))
         torn = np.flatnonzero(links.split)
         below, above = (np.where(s[torn] >= 0, slots[s[torn]], -1) for s in (links.below, links.above))
-        here = [(n >= layout.start) & (n < layout.end) for n in (below, above)]
-        use = np.flatnonzero(here[0] | here[1])
+        # a ghost may stand for a cell of this rank itself, whose own faces count
+        here = owned.reshape(-1)[np.concatenate((self._flat, local))]
+        mine_below, mine_above = ((s[torn] >= 0) & here[s[torn]] for s in (links.below, links.above))
+        use = np.flatnonzero(mine_below | mine_above)
         face = np.empty(len(torn), dtype=np.int64)
         for a in range(grid.dim):
             at = links.axis[torn] == a
@@ -217,6 +219,8 @@ class CutGrid:
                 face[order],
                 below[order],
                 above[order],
+                mine_below[order],
+                mine_above[order],
                 links.openness[torn[order]],
             ),
             slots,

@@ -177,7 +177,7 @@ class MacFluid(FluidField):
             self._kinds_changed()
 
     def cut(self, points: np.ndarray, facets: np.ndarray) -> tuple[Walls, Wet]:
-        """Take over which parts of cells and faces a surface covers; return what it lets through, and bears. Collective.
+        """Take over what a surface covers of cells and faces; return what it lets through, and bears. Collective.
 
         Parameters
         ----------
@@ -257,7 +257,7 @@ class MacFluid(FluidField):
             volume = self.grid.to_vec(self._active).astype(float)
         else:
             volume = self.grid.to_vec(self.volume)
-        if self.extras is not None:
+        if self.extras is not None and self.volume is not None:
             whole = self.volume.copy()
             np.subtract.at(whole.reshape(-1), self.extras.cell, self.extras.volume)
             volume = np.concatenate((self.grid.to_vec(whole), self.extras.volume))

@@ -1,9 +1,9 @@
 """Gravity without spurious currents: the pressure of a fluid at rest is split off and integrated exactly.
 
-With x_0 the upper corner of the grid, p = p' + rho g . (x - x_0). Gravity then drives nothing inside the fluid; it acts
-through open sides, where p = 0 means p' = -rho g . (x - x_0), and through walls, where the force of the second part is an
-exact integral over facets. A fluid at rest has p' constant, whatever cuts the grid, and buoyancy is that of the volume
-which the surface encloses.
+With x_0 the upper corner of the grid, p = p' + rho g . (x - x_0). Gravity then drives nothing inside the fluid; it
+acts through open sides, where p = 0 means p' = -rho g . (x - x_0), and through walls, where the force of the second
+part is an exact integral over facets. A fluid at rest has p' constant, whatever cuts the grid, and buoyancy is that
+of the volume which the surface encloses.
 """
 
 from __future__ import annotations
