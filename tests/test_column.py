@@ -56,26 +56,29 @@ def test_the_step_costs_second_order_in_frequency_and_first_in_damping(coarse_st
 # ---- the coupled system's order in time ---------------------------------------------------------------------
 
 
-def top(integrator, per_period, periods=2):
+def top(integrator, per_period, periods=2, transfer="ray"):
     """Return the step and the motion of the layer's top."""
     column = Column(1.0, 16, wide=1)
     dt = 2 * np.pi / column.omega / per_period
     scene = column.scene(COMM, dt)
     time = scene.time.model_copy(update={"integrator": integrator})
-    return dt, np.array(history(COMM, scene.model_copy(update={"time": time}), MONOLITHIC, periods * per_period))
+    coupling = scene.coupling.model_copy(update={"transfer": transfer})
+    scene = scene.model_copy(update={"time": time, "coupling": coupling})
+    return dt, np.array(history(COMM, scene, MONOLITHIC, periods * per_period))
 
 
-@pytest.fixture(scope="module")
-def tiny_steps():
-    """The motion at 640 steps a period."""
-    return top("midpoint", 640)[1]
+@pytest.fixture(scope="module", params=["ray", "cutcell"])
+def tiny_steps(request):
+    """The transfer, and the motion at 640 steps a period."""
+    return request.param, top("midpoint", 640, transfer=request.param)[1]
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_layer_and_water_together_keep_order_two(integrator, tiny_steps):
+    transfer, tiny_steps = tiny_steps
     errors = []
     for n in (40, 80):
-        _, y = top(integrator, n)
+        _, y = top(integrator, n, transfer=transfer)
         errors.append(np.abs(y - tiny_steps[:: 640 // n]).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1), errors
     assert errors[1] < 0.03 * np.abs(tiny_steps).max()
