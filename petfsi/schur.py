@@ -79,6 +79,7 @@ class SchurStandIn:
             self._pattern = self._set(self.operator, rows, self._pattern)
         else:
             self.operator.assemble()
+            self.operator.stateIncrease()  # a sum does not notice that its terms have changed
 
     def _set(
         self,
