@@ -64,9 +64,6 @@ class PressureSolver:
         """
         self._ksp = ksp
         self._read(PETSc.Options(ksp.getOptionsPrefix()))
-        if self.eliminates and ksp.getType() == PETSc.KSP.Type.CG and not self._symmetric():
-            ksp.setType(PETSc.KSP.Type.GMRES)
-            ksp.setPCSide(PETSc.PC.Side.RIGHT)
         pc = ksp.getPC()
         if pc.getType() == PETSc.PC.Type.MG:
             if hierarchy is None:
@@ -97,6 +94,15 @@ class PressureSolver:
         wrapped.setOperators(*ksp.getOperators())
         ksp.setPC(wrapped)
         self._has_modes = True
+
+    def settle(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
+        """Look after the pressure's KSP once the outer one is set up, which may have made it anew. Collective."""
+        if self._ksp is None or self._ksp.handle != ksp.handle:
+            self._multigrid, self._has_modes, self._built = None, False, None
+            self.connect(ksp, hierarchy)
+        if self.eliminates and ksp.getType() == PETSc.KSP.Type.CG and not self._symmetric():
+            ksp.setType(PETSc.KSP.Type.GMRES)
+            ksp.setPCSide(PETSc.PC.Side.RIGHT)
 
     def _symmetric(self) -> bool:
         return all(coupling.symmetric for coupling in self.system.couplings)
