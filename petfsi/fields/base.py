@@ -61,6 +61,8 @@ class Field(ABC):
         rows and unknowns are comparable numbers.
     n_assembled : int
         How often the block was assembled.
+    pattern_version : int
+        Grows whenever the pattern of the block changes; the same on all ranks.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Field(ABC):
     row_scale: float = 1.0
     col_scale: float = 1.0
     n_assembled: int = 0
+    pattern_version: int = 0
 
     @abstractmethod
     def unknown(self) -> np.ndarray:

@@ -351,6 +351,7 @@ class MacFluid(FluidField):
         if self.extras is not None:
             rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
         set_csr(self.block, *rows, new_pattern=self._new_pattern)
+        self.pattern_version += self._new_pattern
         self._new_pattern = False
         self._assembled_for = (self.geometry_version, factor)
         self.n_assembled += 1
