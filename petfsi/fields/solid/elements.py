@@ -147,10 +147,48 @@ class Elements:
             V = np.where(counted[begin:end], self.volume[begin:end], 0.0)
             elastic += float(V @ self.respond(d, begin, end, body)[0])
             v = u[self.cells[begin:end]]
-            on, off = self.mass_factors[body]
-            squares = (on - off) * np.einsum("eai,eai->e", v, v) + off * np.sum(v.sum(axis=1) ** 2, axis=1)
-            kinetic += float(0.5 * self.bodies.density[body] * (V @ squares))
+            kinetic += float(0.5 * (V @ self._mass_product(body, v, v)))
         return kinetic, elastic
+
+    def powers(
+        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
+    ) -> tuple[float, float]:
+        """Return two powers of a step's forces, over the counted elements, W. Not collective.
+
+        The damping's  w . C w,  and that of the residual of A w - b without loads,
+
+            g . (M (a w - V) + C w + K(d) + K'(d) (s + k w)) .
+
+        Parameters
+        ----------
+        at : State
+            d, V, s at all local nodes.
+        a, k : float
+            1/s, s.
+        w, g : ndarray, shape (n, dim)
+            The solution, and any other velocity, m/s.
+        counted : ndarray of bool, shape (ne,)
+        """
+        damping = power = 0.0
+        axes = np.eye(self.dim)
+        for begin, end, body in self.chunks():
+            part, cells = slice(begin, end), self.cells[begin:end]
+            a0, a1 = self.bodies.mass_damping[body], self.bodies.stiffness_damping[body]
+            V = np.where(counted[part], self.volume[part], 0.0)
+            _, P, C = self.respond(at.displacement, begin, end, body)
+            grad_w, grad_g, grad_s = (self.deformation_gradients(x, begin, end) - axes for x in (w, g, at.shift))
+            stress = np.einsum("eiJkL,ekL->eiJ", C, grad_w)
+            total = P + (k + a1) * stress + np.einsum("eiJkL,ekL->eiJ", C, grad_s)
+            rate = self._mass_product(body, w[cells], w[cells])
+            change = self._mass_product(body, g[cells], (a + a0) * w[cells] - at.inertia[cells])
+            damping += float(V @ (a0 * rate + a1 * np.einsum("eiJ,eiJ->e", stress, grad_w)))
+            power += float(V @ (change + np.einsum("eiJ,eiJ->e", total, grad_g)))
+        return damping, power
+
+    def _mass_product(self, body: int, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return u . M v per volume of elements of one body, from values at their corners (ne, dim + 1, dim)."""
+        on, off = self.mass_factors[body] * self.bodies.density[body]
+        return (on - off) * np.einsum("eai,eai->e", u, v) + off * np.einsum("ei,ei->e", u.sum(axis=1), v.sum(axis=1))
 
     def nodal_mass(self, n: int) -> np.ndarray:
         """Return the mass of each of the first ``n`` nodes: the row sums of M, in kg."""
