@@ -37,8 +37,8 @@ def solid(origin, size, cells, **more):
 
 
 @contextmanager
-def simulation(data):
-    with only_options(["-options_file", "monolithic-direct.opts"]):
+def simulation(data, options="monolithic-direct.opts"):
+    with only_options(["-options_file", options]):
         sim = Simulation(COMM, scene_from_dict(data) if isinstance(data, dict) else data)
         sim.prepare()
         yield sim
@@ -234,7 +234,9 @@ def test_a_restored_state_keeps_the_same_books(integrator):
     box = solid([0.26, 0.27], [0.5, 0.5], [10, 10], damping={"stiffness": 0.001}, initial=throw)
     box["shape"]["cavity"] = cavity
     data = scene(integrator, gravity=[0.0, -9.81], fluid=fluid((20, 20)), solids={"box": box})
-    with simulation(data) as sim, simulation(data) as other:
+    # MUMPS on several ranks does not repeat itself bit for bit
+    default = "monolithic.opts"
+    with simulation(data, default) as sim, simulation(data, default) as other:
         for _ in range(4):
             sim.advance()
         stored = {name: {key: whole(COMM, slab) for key, slab in part.items()} for name, part in sim.state().items()}
