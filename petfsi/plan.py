@@ -14,9 +14,12 @@ import numpy as np
 from petfsi import __version__
 from petfsi.errors import InputError
 from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.stepping import Stepping
 
 #: The options file in force when none is named.
 DEFAULT_OPTIONS = "monolithic.opts"
+#: Steps of changing length are counted up to here.
+MAX_COUNTED = 100_000
 #: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.
 PROGRAM_BYTES = 250e6
 #: Vectors of the length of all unknowns: those of 30 flexible GMRES iterations, and a few more.
@@ -95,13 +98,16 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
     more = "; much more where a large 3D solid is factorised" if nodes and scene.dim == 3 else ""
     rows.append(("memory", f"about {_bytes(memory)}, and {_bytes(PROGRAM_BYTES)} a rank for the program{more}"))
     time = scene.time
-    rows.append(("steps", f"{time.steps:,} of {time.dt:g} s to {time.end:g} s, {time.integrator}"))
+    steps = Stepping(time).count(MAX_COUNTED)
+    number = f"{steps:,}" if steps is not None else "many"
+    dt = time.dt if isinstance(time.dt, str) else f"{time.dt:g}"
+    rows.append(("steps", f"{number} of {dt} s to {time.end:g} s, {time.integrator}"))
     if scene.output.every is not None:
-        times = min(_count(time.end, scene.output.every), time.steps) + 1
+        times = min(_count(time.end, scene.output.every), steps or MAX_COUNTED) + 1
         size = times * _output_bytes(scene, sum(nodes.values()))
         rows.append(("outputs", f"{times:,}, every {scene.output.every:g} s, about {_bytes(size)} in all"))
     every = scene.checkpoint.every
-    written = 1 if every is None else min(_count(time.end, every), time.steps)
+    written = 1 if every is None else min(_count(time.end, every), steps or MAX_COUNTED)
     rows.append(("checkpoints", f"{written:,}, of which the last {min(written, scene.checkpoint.keep)} stay"))
     if scene.probes:
         rows.append(("probes", ", ".join(f"{name} ({p.quantity} of {p.of})" for name, p in scene.probes.items())))

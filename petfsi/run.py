@@ -22,10 +22,11 @@ from petfsi.output.history import History, column_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
-from petfsi.plan import skipped
+from petfsi.plan import MAX_COUNTED, skipped
 from petfsi.ranks import on_root
 from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
+from petfsi.scene.stepping import Stepping
 from petfsi.simulation import Simulation
 
 DONE, STOPPED = 0, 75
@@ -112,21 +113,24 @@ class Run:
             if first:
                 self.files.free_reserve()
 
-    def loop(self, last: int, stop: Stop) -> int:
-        """Step until ``last``; return the exit status. Collective."""
+    def loop(self, steps: int | None, stop: Stop) -> int:
+        """Step until the scene's end, or ``steps`` times; return the exit status. Collective."""
         simulation = self.simulation
-        while simulation.step < last:
+        last = None if steps is None else simulation.step + steps
+        done = simulation.finished
+        while not done:
             begin = clock.perf_counter()
             self.advance()
+            done = simulation.finished or simulation.step == last
             with simulation.phase("observe"):
-                self.observe(final=simulation.step == last)
+                self.observe(final=done)
             seconds = clock.perf_counter() - begin
             self._slowest = max(self._slowest, seconds)
             outcome = simulation.outcome
             self.console.step(
                 simulation.step, simulation.time, simulation.dt, outcome.iterations, outcome.residual, seconds
             )
-            why = stop.asked(self._slowest) if simulation.step < last else ""
+            why = "" if done else stop.asked(self._slowest)
             if why:
                 self.checkpoint()
                 self.summarise("stopped")
@@ -263,8 +267,7 @@ def run_scene(
     simulation = Simulation(comm, scene)
     unread = simulation.prepare()
     files = RunDirectory.create(out, dump_scene(scene), solve.dump_options(), overwrite, comm)
-    last = scene.time.steps if steps is None else min(steps, scene.time.steps)
-    with Console(comm.rank, files.log, total=last) as console:
+    with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
         _greet(console, simulation, unread)
         run = Run(simulation, files, console)
         with run.recorded():
@@ -272,7 +275,7 @@ def run_scene(
             run.append_row()
             if scene.output.every:
                 run.write_fields()
-            return run.loop(last, stop)
+            return run.loop(steps, stop)
 
 
 def resume_run(
@@ -285,7 +288,7 @@ def resume_run(
     scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
     solve.load_options(petsc_args, base=files.options)
     simulation = Simulation(comm, scene)
-    with Console(comm.rank, files.log, total=scene.time.steps) as console:
+    with Console(comm.rank, files.log, total=_total(scene, None)) as console:
         found = checkpoints.find_checkpoint(files.checkpoints, comm, console.warn)
         if found is None:
             raise InputError(
@@ -294,14 +297,19 @@ def resume_run(
         unread = simulation.prepare()  # of the scene's start: it would move the fluid's faces to the restored solid
         simulation.solver.reset()
         with checkpoints.read_checkpoint(found, comm) as stored:
-            simulation.restore(found.step, stored.group)
+            simulation.restore(stored.step, stored.time, stored.dt, stored.group)
         _greet(console, simulation, unread)
         console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
         run = Run(simulation, files, console)
-        last = scene.time.steps if steps is None else min(found.step + steps, scene.time.steps)
         run.open(after=found.step)
         with run.recorded():
-            return run.loop(last, stop)
+            return run.loop(steps, stop)
+
+
+def _total(scene: Scene, steps: int | None) -> int | None:
+    """Return the number of the last step, for the bar; None where counting would take long."""
+    known = [n for n in (Stepping(scene.time).count(MAX_COUNTED), steps) if n is not None]
+    return min(known, default=None)
 
 
 def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:

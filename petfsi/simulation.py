@@ -15,6 +15,7 @@ from petfsi.errors import SolveError
 from petfsi.fields.base import FluidField, Reader, Slab, SolidField
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
+from petfsi.scene.stepping import Stepping
 from petfsi.solve import Outcome, Solver
 from petfsi.system import System
 
@@ -27,7 +28,7 @@ class Simulation:
     Attributes
     ----------
     step, time, dt : int, float, float
-        The present step number, its time (s) and the step (s).
+        The present step number, its time (s) and the length of the step that led there (s; at first of the next).
     outcome : Outcome
         What the last solve reported.
     volume_error : float
@@ -42,8 +43,8 @@ class Simulation:
     def __init__(self, comm: MPI.Comm, scene: Scene) -> None:
         self.comm = comm
         self.scene = scene
-        self.dt = scene.time.dt
-        self.step = 0
+        self._stepping = Stepping(scene.time)
+        self.step, self.time, self.dt = 0, 0.0, self._stepping.length(0.0)
         self.fields = build.build_fields(comm, scene)
         self.couplings = build.build_couplings(scene, self.fields)
         self.solid = next((field for field in self.fields if isinstance(field, SolidField)), None)
@@ -59,9 +60,9 @@ class Simulation:
         self.phases = dict.fromkeys(PHASES, 0.0)
 
     @property
-    def time(self) -> float:
-        """The present time, s."""
-        return self.step * self.dt
+    def finished(self) -> bool:
+        """Whether the scene's end is reached."""
+        return self._stepping.finished(self.time, self.dt)
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
@@ -78,7 +79,8 @@ class Simulation:
         SolveError
             On all ranks; the state is then that of the failed step and must not be used.
         """
-        t, dt = self.time, self.dt
+        t = self.time
+        dt = self.dt = self._stepping.length(t)
         with self.phase("predict"):
             for field in self.fields:
                 field.predict(t, dt)
@@ -92,6 +94,7 @@ class Simulation:
         with self.phase("accept"):
             self._accept(t, dt)
         self.step += 1
+        self.time = self._stepping.after(self.step, t, dt)
 
     def prepare(self) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
@@ -188,16 +191,16 @@ class Simulation:
         accounts = {"accounts": self.accounts.state()} if self.accounts.columns else {}
         return {field.name: field.state() for field in self.fields} | accounts
 
-    def restore(self, step: int, group: Callable[[str], Reader]) -> None:
+    def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:
         """Take up the state of a checkpoint; ``prepare`` comes first. Collective.
 
         Parameters
         ----------
-        step : int
+        step, time, dt : int, float, float
         group : callable
             Returns the reader of a group of ``state`` by its name.
         """
-        self.step = step
+        self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
         if self.accounts.columns:

@@ -242,7 +242,7 @@ def test_a_restored_state_keeps_the_same_books(integrator):
         stored = {name: {key: whole(COMM, slab) for key, slab in part.items()} for name, part in sim.state().items()}
         sim.solver.reset()
         other.solver.reset()
-        other.restore(sim.step, lambda name: reader(stored[name]))
+        other.restore(sim.step, sim.time, sim.dt, lambda name: reader(stored[name]))
         assert other.accounts.values == sim.accounts.values
         for _ in range(4):
             sim.advance()

@@ -107,6 +107,50 @@ def test_a_killed_run_resumes_bit_for_bit(ranks, straight, tmp_path):
     assert (straight(ranks) / "history.csv").read_bytes() == (tmp_path / "run" / "history.csv").read_bytes()
 
 
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize(
+    "integrator, dt",
+    [("newmark", "(1 + t)/40"), ("bdf2", "(1 + 0.4*sin(20*t))/30"), ("midpoint", "(1 + 0.4*sin(20*t))/30")],
+)
+def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, ranks, tmp_path):
+    sets = ("--set", f"time.integrator={integrator}", "--set", f"time.dt='{dt}'", "--set", "time.end=0.3")
+    sets = (*sets, "--set", "checkpoint.every=0.11")
+    for name, steps in (("straight", ()), ("stopped", ("--steps", 6))):
+        petfsi("run", BAR, "--out", tmp_path / name, *sets, *steps, ranks=ranks)
+    petfsi("resume", tmp_path / "stopped", ranks=ranks)
+    want, got = last_output(tmp_path / "straight"), last_output(tmp_path / "stopped")
+    assert want.keys() == got.keys() and len(want) > 10
+    different = [name for name in want if not np.array_equal(want[name], got[name])]
+    assert not different
+    histories = [(tmp_path / name / "history.csv").read_bytes() for name in ("straight", "stopped")]
+    assert histories[0] == histories[1]
+    history = read_history(tmp_path / "straight" / "history.csv")
+    np.testing.assert_allclose(np.cumsum(history["dt"][1:]), history["time"][1:], rtol=1e-14)
+    assert 0.3 <= history["time"][-1] < 0.3 + history["dt"][-1] and np.ptp(history["dt"][1:]) > 0.005
+
+
+def test_a_step_that_is_not_positive_ends_the_run_with_its_time(tmp_path):
+    done = subprocess.run(
+        command("run", SCENES / "beam.toml", "--out", tmp_path / "run", "--set", "time.dt='0.02 - t/4'"),
+        capture_output=True, text=True, timeout=300, env=environment(),
+    )  # fmt: skip
+    assert done.returncode == 3
+    assert "time.dt = '0.02 - t/4'" in done.stderr and "at t = 0.0" in done.stderr
+    assert "must be greater than" in done.stderr and summary(tmp_path / "run")["status"] == "failed"
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
+def test_two_ranks_and_then_three_equal_one_with_any_integrator(integrator, tmp_path):
+    sets = ("--set", f"time.integrator={integrator}", "--set", "output={}", "--set", "time.end=0.4")
+    options = ("-options_file", "monolithic-direct.opts")
+    petfsi("run", BAR, "--out", tmp_path / "one", *sets, *options)
+    petfsi("run", BAR, "--out", tmp_path / "two", *sets, *options, "--steps", 5, ranks=2)
+    petfsi("resume", tmp_path / "two", ranks=3)
+    one, two = (read_history(tmp_path / name / "history.csv") for name in ("one", "two"))
+    for name in ("tip.x", "tip.y"):
+        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-8 * np.abs(one[name]).max())
+
+
 def test_two_ranks_go_on_as_three(straight, tmp_path):
     petfsi("run", BAR, "--out", tmp_path / "run", "--steps", 13, ranks=2)
     petfsi("resume", tmp_path / "run", ranks=3)

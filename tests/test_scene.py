@@ -12,6 +12,7 @@ from petfsi.errors import InputError
 from petfsi.scene.checks import RESERVED_PROBES, check_inside_grid, expressions
 from petfsi.scene.load import RESUMABLE, apply_set, dump_scene, load_scene, parse_value, scene_from_dict
 from petfsi.scene.schema import Scene
+from petfsi.scene.stepping import Stepping
 
 LAYER = """
 title = "An elastic \\"layer\\" under water, \\u00b0C \\\\ \\u007f"
@@ -144,6 +145,12 @@ BROKEN = [
     (["dim=true"], "dim = true", "must be 2 or 3"),
     (["time.dt=0"], "time.dt = 0", "must be greater than 0 (s)"),
     (["time.dt=nan"], "time.dt = nan", "(s)"),
+    (["time.dt=0.1*x"], 'time.dt = "0.1*x"', "unknown name 'x'; known are t, pi, e"),
+    (["time.dt=0.1 - 0.1"], 'time.dt = "0.1 - 0.1"', "must be greater than 0 (s)"),
+    (["time.dt=t"], 'time.dt = "t"', "is 0 at t = 0; must be greater than 0 (s)"),
+    (["time.dt=1/t"], 'time.dt = "1/t"', "is inf at t = 0; it must be finite"),
+    (["time.dt=3 + t"], 'time.dt = "3 + t"', "must not exceed time.end = 2 s"),
+    (["time.dt=[1]"], "time.dt = [1]", "must be a number or an expression in quotes (s)"),
     (["time.end='2'"], 'time.end = "2"', "must be a number (s)"),
     (["time.integrator=bdf9"], 'time.integrator = "bdf9"', "must be 'newmark'"),
     (["fluid=3"], "fluid = 3", "must be a table"),
@@ -630,14 +637,41 @@ def test_a_resumed_run_may_change_when_it_ends_and_what_it_writes(tmp_path):
     "end, dt, steps", [(2.0, 0.01, 200), (0.3, 0.1, 3), (1.0, 0.3, 4), (0.1, 0.1, 1), (1.0, 1e-6, 10**6), (0.7, 0.1, 7)]
 )
 def test_steps_reach_the_end_and_round_off_adds_none(end, dt, steps):
-    assert scene_from_dict(layer(f"time.end={end}", f"time.dt={dt}")).time.steps == steps
+    stepping = Stepping(scene_from_dict(layer(f"time.end={end}", f"time.dt={dt}")).time)
+    assert stepping.count(0) == steps
+    assert stepping.finished(stepping.after(steps, 0.0, dt), dt)
+    assert not stepping.finished(stepping.after(steps - 1, 0.0, dt), dt)
+
+
+@pytest.mark.parametrize(
+    "dt, steps", [("0.1", 20), ("0.1 + 0*t", 20), ("0.1*(1 + (t >= 1 - 1e-9))", 15), ("0.3 + t", 3)]
+)
+def test_steps_of_any_length_reach_the_end(dt, steps):
+    """The last adds 0.3, 0.6 and 1.2 s."""
+    stepping = Stepping(scene_from_dict(layer(f"time.dt={dt}")).time)
+    assert stepping.count(100) == steps
+    assert stepping.constant == (dt == "0.1")
+    assert stepping.constant or stepping.count(steps - 1) is None
+
+
+def test_a_step_that_shrinks_to_nothing_is_told():
+    stepping = Stepping(scene_from_dict(layer("time.dt=0.5 - t/2")).time)
+    with pytest.raises(InputError, match=r"time.dt = '0.5 - t/2': is 0 at t = 1; must be greater than 0"):
+        stepping.length(1.0)
+    with pytest.raises(InputError, match=r"is 5.00155e-14 at t = 1; must be greater than 1e-12 of time.end"):
+        stepping.length(1.0 - 1e-13)
+    assert stepping.count(1000) is None
 
 
 def test_a_mesh_outside_the_grid_is_refused():
     scene = scene_from_dict(layer())
     check_inside_grid(scene, "solids.bunny.shape", np.array([[0.0, 0.0], [1.0 + 1e-12, 2.0]]))
-    with pytest.raises(InputError, match=r'solids.bunny.shape = "y from 0.5 to 2.5 m": y must lie inside'):
-        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, 2.5]]))
+    with pytest.raises(InputError, match=r'solids.bunny.shape = "y from -0.5 to 0.5 m": y must lie inside'):
+        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, -0.5]]))
+    # the top is open: a solid may float there, but not lie beyond it
+    check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 0.5], [0.5, 2.5]]))
+    with pytest.raises(InputError, match=r'"y from 2.1 to 2.5 m": y must lie inside'):
+        check_inside_grid(scene, "solids.bunny.shape", np.array([[0.5, 2.1], [0.5, 2.5]]))
     dry = without(layer(), "fluid", "obstacles", "probes.gauge")
     check_inside_grid(scene_from_dict(dry), "solids.bunny.shape", np.array([[9.0, 9.0]]))
 

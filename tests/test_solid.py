@@ -216,6 +216,56 @@ def test_an_integrator_keeps_its_order_on_a_nonlinear_oscillation(integrator, co
     assert seen == pytest.approx(INTEGRATORS[integrator].order, abs=0.1), errors
 
 
+def test_midpoint_keeps_the_energy_of_small_swings():
+    """So small that the force is linear, and the energy quadratic; Newmark's scheme loses most of it."""
+    left = {}
+    for integrator in ("newmark", "midpoint"):
+        start = {"velocity": [0.0, "1e-7*sin(3*x)"]}
+        support = [{"where": "left", "fix": ["x", "y"]}]
+        solid = field(2, integrator=integrator, b=body(2, (6, 3), supports=support, initial=start))
+        first = sum(solid.energies().values())
+        energies = []
+        for n in range(40):
+            step(solid, 0.1 * n, 0.1)
+            energies.append(sum(solid.energies().values()) / first)
+        left[integrator] = energies
+    np.testing.assert_allclose(left["midpoint"], 1.0, rtol=1e-6)
+    assert left["newmark"][-1] < 0.5
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_any_integrator_lets_a_free_body_fall_without_deforming(dim, integrator):
+    solid = field(dim, gravity=[0.0, -9.81, 0.0][:dim], integrator=integrator, b=body(dim))
+    h, n = 0.05, 10
+    for k in range(n):
+        step(solid, k * h, h)
+    speed = -9.81 * n * h
+    np.testing.assert_allclose(solid.velocity, np.tile([0.0, speed, 0.0][:dim], (len(solid.velocity), 1)), atol=1e-11)
+    assert np.ptp(solid.displacement, axis=0).max() < 1e-11
+    assert solid.quality() == pytest.approx(1.0, abs=1e-11)
+
+
+@pytest.mark.parametrize("integrator, at_end", [("bdf2", True), ("midpoint", False)])
+def test_prescribed_nodes_and_the_surface_follow_the_scheme(integrator, at_end):
+    """w holds at the end of BDF2's step and in the middle of midpoint's; the surface waits where the step will be."""
+    supports = [{"where": "all", "fix": ["x", "y"], "velocity": {"x": "1 + t**2"}}]
+    solid = field(2, integrator=integrator, b=body(2, supports=supports))
+    h, t, rest = 0.1, 0.0, solid.surface_positions()
+    for _ in range(4):
+        d = solid.displacement[:, 0].copy()
+        solid.predict(t, h)
+        waits = (solid.surface_positions() - rest)[:, 0]
+        step(solid, t, h)
+        t += h
+        np.testing.assert_allclose(solid.velocity[:, 0], 1 + t**2, rtol=1e-12)
+        w = 1 + t**2 if at_end else 1 + (t**2 + (t - h) ** 2) / 2
+        np.testing.assert_allclose(solid.surface_velocity()[:, 0], w, rtol=1e-12)
+        np.testing.assert_allclose(solid.fixed_velocity()[::2], w, rtol=1e-12)
+        there = solid.displacement[:, 0] if at_end else (solid.displacement[:, 0] + d) / 2
+        assert np.abs(waits - there[0]).max() < 2 * h**2
+        np.testing.assert_allclose((solid.surface_positions() - rest)[:, 0], solid.displacement[0, 0], rtol=1e-12)
+
+
 def test_a_bar_swings_axially_at_its_closed_form_frequency():
     """Fixed at one end: omega = pi c / (2 L), c^2 = E / density at zero Poisson ratio; error of second order."""
     length, young, errors = 2.0, 100.0, []

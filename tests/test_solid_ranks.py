@@ -10,6 +10,7 @@ from solid_cases import YOUNG, body, field, gathered, step, wave
 from petfsi.errors import InputError
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.partition import Fetch, bisect
+from petfsi.integrators import INTEGRATORS
 from petfsi.petsc import Layout
 
 
@@ -101,17 +102,18 @@ def test_cavities_are_marked_and_empty_ones_too(dim, interior):
 # ---- ranks and state ----------------------------------------------------------------------------------------
 
 
-def busy(comm, dim):
+def busy(comm, dim, integrator="newmark"):
     support = [{"where": "left", "fix": ["x", "y"], "velocity": {"x": "0.2*cos(9*t)"}}]
     first = body(dim, (5, 3, 2), supports=support, damping={"stiffness": 0.01},
                  initial={"velocity": ["y", "0.5*x", 0.1][:dim]})  # fmt: skip
     second = body(dim, (2, 4, 3), origin=(0.3, 2.0, 0.1), mass="lumped", initial={"displacement": ["0.1*x"] * dim})
-    return field(dim, comm, gravity=["sin(t)", -1.0, 0.2][:dim], first=first, second=second)
+    return field(dim, comm, gravity=["sin(t)", -1.0, 0.2][:dim], integrator=integrator, first=first, second=second)
 
 
 @pytest.mark.parallel([1, 3])
-def test_ranks_agree_with_one_rank(dim):
-    many, one = busy(MPI.COMM_WORLD, dim), busy(MPI.COMM_SELF, dim)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_ranks_agree_with_one_rank(dim, integrator):
+    many, one = busy(MPI.COMM_WORLD, dim, integrator), busy(MPI.COMM_SELF, dim, integrator)
     for k in range(5):
         step(many, 0.05 * k, 0.05)
         step(one, 0.05 * k, 0.05)
@@ -127,15 +129,21 @@ def test_ranks_agree_with_one_rank(dim):
 
 
 @pytest.mark.parallel([1, 3])
-def test_state_comes_back_bit_for_bit_on_other_ranks(dim):
-    many, one = busy(MPI.COMM_WORLD, dim), busy(MPI.COMM_SELF, dim)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_state_comes_back_bit_for_bit_on_other_ranks(dim, integrator):
+    many, one = busy(MPI.COMM_WORLD, dim, integrator), busy(MPI.COMM_SELF, dim, integrator)
     for solid in (many, one):
         n = len(gathered(solid, "points"))
         own = solid._mesh.natural[: len(solid.reference)]
         solid.displacement, solid.velocity = wave(n, dim)[own], wave(n, dim, seed=6)[own]
+        if solid._past:
+            solid._past = tuple(wave(n, dim, seed=seed)[own] for seed in (7, 8))
+            solid._past_dt = 0.04
 
     def store(solid):
-        return {name: gathered(solid, name) for name in solid.state()}
+        return {
+            name: np.concatenate([s.data for s in solid.comm.allgather(slab)]) for name, slab in solid.state().items()
+        }
 
     def reader(stored):
         def read(name, start, count):
@@ -144,16 +152,17 @@ def test_state_comes_back_bit_for_bit_on_other_ranks(dim):
         return read
 
     def state_of(solid):
-        return solid.displacement, solid.velocity
+        return solid.displacement, solid.velocity, *solid._past, np.array(solid._past_dt if solid._past else 0)
 
     for source, target in ((many, one), (one, many), (many, many)):
-        fresh = busy(target.comm, dim)
+        fresh = busy(target.comm, dim, integrator)
         fresh.restore(reader(store(source)))
         for got, expected in zip(state_of(fresh), state_of(target), strict=True):
             np.testing.assert_array_equal(got, expected)
         fresh.assemble(0.3, 0.05)
         target.assemble(0.3, 0.05)
         np.testing.assert_array_equal(fresh.rhs, target.rhs)
+        np.testing.assert_array_equal(fresh.unknown(), target.unknown())
         np.testing.assert_array_equal(fresh.block.getValuesCSR()[2], target.block.getValuesCSR()[2])
 
 

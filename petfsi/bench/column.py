@@ -85,6 +85,7 @@ class Column:
             "fluid.size": [width, self.height],
             "fluid.cells": [self.wide, self.cells],
             "coupling.transfer": "ray",
+            "time.integrator": "newmark",
             "fluid.initial.velocity": [0.0, SPEED * float(np.sin(x))],
             "solids.layer.shape.box.size": [width, SOLID_HEIGHT],
             "solids.layer.shape.box.cells": [max(1, self.wide // 2), self.cells // 8],

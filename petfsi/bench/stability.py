@@ -60,7 +60,7 @@ def judge(comm: MPI.Comm, scene: Scene, options: str) -> Row:
     with simulation(comm, scene, options) as sim:
         tip = [n for n, name in enumerate(sim.probe_columns()) if name.startswith("tip.")]
         try:
-            while sim.step < scene.time.steps and not why:
+            while not sim.finished and not why:
                 sim.advance()
                 largest = max(largest, float(np.linalg.norm(np.array(sim.probe())[tip])))
                 if not largest < length:
@@ -71,7 +71,7 @@ def judge(comm: MPI.Comm, scene: Scene, options: str) -> Row:
     seconds = comm.bcast(clock.perf_counter() - start)
     return {
         "stable": not why,
-        "steps": scene.time.steps,
+        "steps": sim.step,
         "failed at step": failed,
         "largest displacement": largest,
         "seconds": seconds,

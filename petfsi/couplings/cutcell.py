@@ -27,6 +27,8 @@ class CutCellCoupling(Coupling):
     the solver's tolerance, and the system is symmetric quasi-definite.
     """
 
+    symmetric = True
+
     def __init__(self, fluid: MacFluid, solid: SolidField, spec: schema.Coupling) -> None:
         self.fluid, self.solid = fluid, solid
         self.comm: MPI.Comm = fluid.comm
@@ -90,8 +92,9 @@ class CutCellCoupling(Coupling):
         columns = np.tile(np.arange(dim), points.size)
         self._point_weight = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))
         force = (self._free_map.T @ self._point_weight).tocoo()
-        rows = gather_triplets(self.comm, layout, self._free[force.row], force.col.astype(np.int64), force.data)
-        return csr_matrix((rows[2], rows[1], rows[0]), shape=(layout.n_local, dim))
+        columns = force.col.astype(np.int64)
+        indptr, indices, values = gather_triplets(self.comm, layout, self._free[force.row], columns, force.data)
+        return csr_matrix((values, indices, indptr), shape=(layout.n_local, dim))
 
     def assemble(self, time: float, dt: float) -> None:
         """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""

@@ -127,9 +127,9 @@ def cut(points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0)
     area = area_vectors(x * dx, facets)
     size = np.linalg.norm(area, axis=1, keepdims=True)
     lo, hi = (np.asarray(end, dtype=np.int64) for end in (lattice.lo, lattice.hi))
-    frame = Frame(lo - 1, hi + 1, dx, area / np.where(size > 0.0, size, 1.0))
     facets = np.ascontiguousarray(facets, dtype=np.int32)
-    images = _images(x, facets, lattice, frame)
+    images, near_lo, near_hi = _reach(x, facets, lattice, lo, hi)
+    frame = Frame(near_lo - 1, near_hi + 1, dx, area / np.where(size > 0.0, size, 1.0))
     patches, sums = find_patches(x, facets, frame, images)
     shape = frame.hi - frame.lo
     count = np.bincount(patches.cell, minlength=int(np.prod(shape)))
@@ -137,51 +137,59 @@ def cut(points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0)
     integrals = patches.integrals
     patches = Patches(*(part[order] for part in patches._replace(integrals=integrals[:, :0])))
     opening = _open_faces(sums, count.reshape(shape), base)
-    inner, cell = _box_cells(patches.cell, shape)
-    box = Box(frame.lo, shape, images)
-    pieces = find_pieces(x, facets, box, patches, inner, opening)
+    volume = _volumes(patches, frame, opening[-1])
+    inner, cell = _box_cells(patches.cell, frame, lo, hi)
+    pieces = find_pieces(x, facets, Box(frame.lo, shape, images, lo, hi), patches, inner, opening)
     some = np.flatnonzero(inner & np.any(patches.vectors != 0.0, axis=1))
-    cell, integrals = cell[some], integrals[order[some]]
+    integrals = integrals[order[some]]
     return CutCells(
         facet=patches.facet[some],
-        cell=cell,
+        cell=cell[some],
         piece=pieces.patch_piece[some],
         integrals=integrals[:, :dim],
         moments=integrals[:, dim:].reshape(-1, dim, dim),
         normals=frame.normals,
-        open=opening,
-        volume=_volumes(cell, patches.vectors[some, -1], opening[-1]),
-        extra_cell=_box_cells(pieces.extra_cell, shape)[1],
+        open=[_embedded(part, near_lo - lo, hi - lo + (np.arange(dim) == a), base) for a, part in enumerate(opening)],
+        volume=_embedded(volume, near_lo - lo, hi - lo, base),
+        extra_cell=_box_cells(pieces.extra_cell, frame, lo, hi)[1],
         extra_piece=pieces.extra_piece,
         extra_volume=pieces.extra_volume,
         link_axis=pieces.link_axis,
-        link_face=_box_faces(pieces.link_cell, pieces.link_axis, shape),
+        link_face=_box_faces(pieces.link_cell, pieces.link_axis, frame, lo, hi),
         link_below=pieces.link_below,
         link_above=pieces.link_above,
         link_open=pieces.link_open,
     )
 
 
-def _images(x: np.ndarray, facets: np.ndarray, lattice: Lattice, frame: Frame) -> np.ndarray:
-    """Return the periodic images of the surface that reach into or below the box, as shifts in cells (k, dim).
+def _reach(
+    x: np.ndarray, facets: np.ndarray, lattice: Lattice, lo: np.ndarray, hi: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the periodic images of the surface that matter to the box, and the part of the box that they reach.
 
-    Below the box those count that also reach into it or beyond; what lies wholly below covers nothing.
+    An image matters if it reaches into the box or its margin; what lies wholly below covers nothing in the end.
+
+    Returns
+    -------
+    images : ndarray of int64, shape (k, dim)
+        How far each is moved, in cells.
+    near_lo, near_hi : ndarray of int64, shape (dim,)
     """
     dim = x.shape[1]
-    if len(facets) == 0 or not np.any(lattice.periodic):
-        return np.zeros((min(len(facets), 1), dim), dtype=np.int64)
-    used = x[facets.ravel()]
+    if len(facets) == 0:
+        return np.zeros((0, dim), dtype=np.int64), lo, lo
+    used = x if len(x) <= facets.size else x[facets.ravel()]
     low, high = used.min(axis=0), used.max(axis=0)
     shifts = []
+    near_lo, near_hi = lo.copy(), lo.copy()
     for a in range(dim):
-        if not lattice.periodic[a]:
-            shifts.append([0])
-            continue
-        n = int(lattice.cells[a])
-        first = math.ceil((frame.lo[a] - high[a]) / n)
-        last = math.floor((frame.hi[a] - low[a]) / n)
+        n = int(lattice.cells[a]) if lattice.periodic[a] else 0
+        first = math.ceil((lo[a] - 1 - high[a]) / n) if n else 0
+        last = math.floor((hi[a] + 1 - low[a]) / n) if n else 0
         shifts.append([n * s for s in range(first, last + 1)])
-    return np.array(list(itertools.product(*shifts)), dtype=np.int64).reshape(-1, dim)
+        near_lo[a] = np.clip(math.floor(low[a]) + n * first, lo[a], hi[a])
+        near_hi[a] = np.clip(math.floor(high[a]) + 1 + n * last, near_lo[a], hi[a])
+    return np.array(list(itertools.product(*shifts)), dtype=np.int64).reshape(-1, dim), near_lo, near_hi
 
 
 def _open_faces(sums: list[np.ndarray], count: np.ndarray, base: int) -> list[np.ndarray]:
@@ -219,30 +227,41 @@ def _open_along(sums, count, base):
                 sums[i, j, k] = fraction if near and abs(fraction - whole) > TINY else whole
 
 
-def _volumes(cell: np.ndarray, flux: np.ndarray, opening: np.ndarray) -> np.ndarray:
-    """Return the open fraction of the box's cells by the divergence theorem along the last axis.
+def _volumes(patches: Patches, frame: Frame, opening: np.ndarray) -> np.ndarray:
+    """Return the open fraction of the frame's cells by the divergence theorem along the last axis.
 
-    ``flux`` is int x_a dA_a of each patch, ``opening`` the open fraction of the faces normal to that axis.
+    ``opening`` is that of the faces normal to it, the margin left out, as in what is returned.
     """
     low, high = opening[..., :-1], opening[..., 1:]
-    inside = np.bincount(cell, weights=flux, minlength=low.size).reshape(low.shape)
-    return np.clip(0.5 * (low + high) - inside, 0.0, 1.0)
+    inner, cell = _box_cells(patches.cell, frame, frame.lo + 1, frame.hi - 1)
+    flux = np.bincount(cell[inner], weights=patches.vectors[inner, -1], minlength=low.size)
+    return np.clip(0.5 * (low + high) - flux.reshape(low.shape), 0.0, 1.0)
 
 
-def _box_cells(cell: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which cells of the box with its margin are the box's, and their flat index in it (else nonsense)."""
-    index = np.array(np.unravel_index(cell, shape)).reshape(len(shape), -1) - 1
-    inner = np.all((index >= 0) & (index < shape[:, None] - 2), axis=0)
-    return inner, np.ravel_multi_index(tuple(index), tuple(shape - 2), mode="clip").astype(np.int64)
+def _embedded(part: np.ndarray, place: np.ndarray, shape: np.ndarray, base: int) -> np.ndarray:
+    """Return what is open of a whole box, of which a part begins at a place and the rest is far from surfaces."""
+    whole = np.full(tuple(shape), 1.0 if base == 0 else 0.0)
+    whole[tuple(slice(p, p + n) for p, n in zip(place, part.shape, strict=True))] = part
+    return whole
 
 
-def _box_faces(above: np.ndarray, axis: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return the flat index of faces among the box's faces of their axis; ``above`` are cells of box and margin."""
-    index = np.array(np.unravel_index(above, shape)).reshape(len(shape), -1) - 1
+def _box_cells(cell: np.ndarray, frame: Frame, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which cells of the frame do not belong to its margin, and their flat index in a box that holds them."""
+    shape = frame.hi - frame.lo
+    index = np.array(np.unravel_index(cell, shape)).reshape(len(shape), -1)
+    inner = np.all((index > 0) & (index < shape[:, None] - 1), axis=0)
+    inside = tuple(index + (frame.lo - lo)[:, None])
+    return inner, np.ravel_multi_index(inside, tuple(np.maximum(hi - lo, 1)), mode="clip").astype(np.int64)
+
+
+def _box_faces(above: np.ndarray, axis: np.ndarray, frame: Frame, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """Return the flat index of faces among the box's faces of their axis; ``above`` are cells of the frame."""
+    dim = len(lo)
+    index = np.array(np.unravel_index(above, frame.hi - frame.lo)).reshape(dim, -1) + (frame.lo - lo)[:, None]
     face = np.zeros(len(above), dtype=np.int64)
-    for a in range(len(shape)):
+    for a in range(dim):
         mine = axis == a
-        face[mine] = np.ravel_multi_index(tuple(index[:, mine]), tuple(shape - 2 + (np.arange(len(shape)) == a)))
+        face[mine] = np.ravel_multi_index(tuple(index[:, mine]), tuple(hi - lo + (np.arange(dim) == a)))
     return face
 
 

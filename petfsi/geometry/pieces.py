@@ -20,7 +20,7 @@ SAME = 1e-9
 
 
 class Box(NamedTuple):
-    """The box, with its margin, as the kernels see it.
+    """The part of the box that the surface reaches, with a margin of one cell.
 
     Attributes
     ----------
@@ -30,17 +30,21 @@ class Box(NamedTuple):
         With the margin.
     images : ndarray of int64, shape (k, dim)
         How far each image of the surface is moved, in cells.
+    box_lo, box_hi : ndarray of int64, shape (dim,)
+        The box.
     """
 
     lo: np.ndarray
     shape: np.ndarray
     images: np.ndarray
+    box_lo: np.ndarray
+    box_hi: np.ndarray
 
 
 class Pieces(NamedTuple):
-    """Pieces and links as in ``clipping.CutCells``, but cells and faces are numbered in the box with its margin.
+    """Pieces and links as in ``clipping.CutCells``, but cells are numbered in ``Box`` with its margin.
 
-    ``link_cell`` is the cell above the face. Above the box it lies in the margin.
+    ``link_cell`` is the cell above the face, which may lie in the margin.
     """
 
     patch_piece: np.ndarray
@@ -88,11 +92,21 @@ def find_pieces(
         side = (np.arange(dim) == face // 2) * (face % 2)
         openings[:, face] = opening[face // 2][tuple(index + side[:, None])]
     split, patch_piece, extras = split_cells(
-        x, facets, beyond, box, patches.facet, patches.image, patches.cell, parts, patches.vectors, ranges, openings
+        x,
+        facets,
+        beyond if dim == 3 else None,
+        box,
+        patches.facet,
+        patches.image,
+        patches.cell,
+        parts,
+        patches.vectors,
+        ranges,
+        openings,
     )
-    place = np.column_stack(np.unravel_index(split.cell, box.shape)).reshape(-1, dim)
+    place = np.column_stack(np.unravel_index(split.cell, box.shape)).reshape(-1, dim) + box.lo
     stride = np.append(np.cumprod(box.shape[:0:-1])[::-1], 1)
-    links, link_open = link_pieces(split, stride, place == 1, place == box.shape - 2)
+    links, link_open = link_pieces(split, stride, place == box.box_lo, place == box.box_hi - 1)
     return Pieces(
         patch_piece,
         extras[:, 0].astype(np.int64),
@@ -274,6 +288,8 @@ def split_cells(x, facets, beyond, box, facet, image, cell, parts, vectors, rang
 
     Parameters
     ----------
+    beyond : ndarray of int, shape (m, 3)
+        As ``neighbours`` returns it; None in 2D.
     parts : ndarray of int, shape (n,)
         As ``connected_parts`` returns them.
     ranges : ndarray of int, shape (k, 2)
@@ -294,7 +310,7 @@ def split_cells(x, facets, beyond, box, facet, image, cell, parts, vectors, rang
         first, last = ranges[r]
         part, n_parts = _count_parts(parts[first:last])
         at = _places(cell[first], box)
-        if dim == 2:
+        if beyond is None:  # told apart when compiled: the other walk is not
             parent, state, elements, key, good = walk_2d(
                 x, facets, at, facet[first:last], image[first:last], part, n_parts, openings[r]
             )

@@ -61,7 +61,7 @@ def write_checkpoint(
     directory : Path
         Is made if need be.
     step, time, dt : int, float, float
-        The step that was finished last, the time reached (s), the length of the next step (s).
+        The step that was finished last, the time reached (s), its length (s).
     groups : mapping of str to mapping of str to Slab
         The state of every field, by the field's name.
     attributes : mapping

@@ -27,6 +27,7 @@ from petfsi.scene.shape_checks import (
     sizes,
     solid_shape,
 )
+from petfsi.scene.stepping import Stepping
 
 MAX_STEPS = 10**8
 
@@ -80,10 +81,16 @@ def _names(scene: Scene) -> Problems:
 
 def _time(scene: Scene) -> Problems:
     time = scene.time
-    if time.dt > time.end:
+    try:
+        stepping = Stepping(time)
+        dt = stepping.length(0.0)
+    except ExpressionError as error:
+        yield Problem("time.dt", time.dt, error.reason, ("time.end",))
+        return
+    if dt > time.end:
         yield Problem("time.dt", time.dt, f"must not exceed time.end = {time.end:g} s", ("time.end",))
-    elif not time.end / time.dt <= MAX_STEPS:
-        allowed = f"makes {time.end / time.dt:.3g} steps to time.end = {time.end:g} s; at most {MAX_STEPS:.0e} may be"
+    elif stepping.constant and not time.end / dt <= MAX_STEPS:
+        allowed = f"makes {time.end / dt:.3g} steps to time.end = {time.end:g} s; at most {MAX_STEPS:.0e} may be"
         yield Problem("time.dt", time.dt, allowed, ("time.end",))
 
 
@@ -194,12 +201,15 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
 
 
 def _outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
-    """Yield a problem if a solid's bounding box does not lie in the grid."""
+    """Yield a problem if a bounding box does not lie in the grid, but for what reaches through an open side."""
     if not is_measured(fluid, len(low)):
         return
-    for axis, a, b, start, size in zip("xyz", low, high, fluid.origin, fluid.size, strict=False):
-        if a < start - SLACK * size or b > start + size + SLACK * size:
-            allowed = f"{axis} must lie inside the fluid's grid, {start:g} to {start + size:g} m"
+    for axis, a, b, start, size, sides in zip("xyz", low, high, fluid.origin, fluid.size, OPPOSITE, strict=False):
+        end, slack = start + size, SLACK * size
+        # floats: a part of it at least must be in the grid
+        through = [getattr(fluid.sides, side) == "open" and a < end and b > start for side in sides]
+        if (a < start - slack and not through[0]) or (b > end + slack and not through[1]):
+            allowed = f"{axis} must lie inside the fluid's grid, {start:g} to {end:g} m"
             yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.origin", "fluid.size"))
 
 

@@ -57,15 +57,15 @@ class Time(Table):
     """When the run ends and how it steps."""
 
     end: Annotated[Real, Field(gt=0, description="s")]
-    dt: Annotated[Real, Field(gt=0, description="s")]
+    dt: Annotated[Number, Field(description="s")]
     integrator: Literal["newmark", "bdf2", "midpoint"] = "newmark"
 
-    @property
-    def steps(self) -> int:
-        """How many steps of ``dt`` reach ``end``; round-off in their ratio adds none."""
-        ratio = self.end / self.dt
-        nearest = round(ratio)
-        return max(1, nearest if abs(ratio - nearest) < 1e-9 * ratio else math.ceil(ratio))
+    @field_validator("dt")
+    @classmethod
+    def _positive(cls, dt: float | str) -> float | str:
+        if not isinstance(dt, str) and dt <= 0:
+            raise PydanticCustomError("greater_than", "must be greater than 0", {"gt": 0})
+        return dt
 
 
 # ---- shapes -------------------------------------------------------------------------------------------------

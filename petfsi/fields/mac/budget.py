@@ -39,9 +39,9 @@ class Forces:
     smoke: np.ndarray | None
 
     @classmethod
-    def of(cls, gravity: np.ndarray, heavy: bool, buoyancy: float, smoke: np.ndarray | None) -> Forces | None:
-        """Return gravity (where the fluid is ``heavy``) and buoyancy, or None if there is neither."""
-        plain, lift = gravity if heavy else 0.0 * gravity, -buoyancy * gravity
+    def of(cls, gravity: np.ndarray, heavy: list[bool], buoyancy: float, smoke: np.ndarray | None) -> Forces | None:
+        """Return gravity (along axes where the fluid is ``heavy``) and buoyancy, or None if there is neither."""
+        plain, lift = np.where(heavy[: len(gravity)], gravity, 0.0), -buoyancy * gravity
         if not np.any(plain) and not np.any(lift):
             return None
         return cls(plain, lift, smoke if np.any(lift) else None)

@@ -6,18 +6,18 @@ With p at cell centres x_c and v on faces, n the normal out of the solid and A_f
 
 With w = 1 in the wall's own cell and B_f the open fraction alpha_f of a face this is the scheme of Ng, Min and Gibou
 (An efficient fluid-solid coupling algorithm for single-phase flows, 2009). It takes the pressure on a wall from
-the centre of a cell, which along a wall that is parallel to an axis is wrong by half a cell of fluid everywhere, in the same
-sense: first order. There the a-component of the traction takes p by linear extrapolation along axis a from the wall's own
-cell and the next one on the fluid's side, t = theta (x_a - x_c,a) / dx towards it: w = 1 - t on the one, t on the other;
-and what J so takes from a cell is given to the face between the two,
+the centre of a cell. Along a wall that is parallel to an axis that is wrong by the same part of a cell everywhere:
+first order. There the a-component of the traction takes p by linear extrapolation along axis a from the wall's own
+cell and the next one on the fluid's side, t = theta (x_a - x_c,a) / dx towards it: w = 1 - t on the one, t on the
+other; and what J so takes from a cell is given to the face between the two,
 
     B_f = alpha_f - (theta / (A_f dx)) sum over both cells' walls that face f of ∫ n_a (x_a - x_c,a) dA ,
 
-so that rho B_f A_f dx is the mass of the fluid between the two pressures along the axis, counted to the walls. A fluid and
-solids that move alike have no net outflow anywhere, whatever theta. A flow along a slanting wall has none only if
-theta = 0: different weights for the components of n would let it through. Hence theta = max(0, 1 - |N_t| / |N_a|), N_a and N_t
-being the normal's part along the axis and the rest. On disks and balls, whose walls slant everywhere but at a few places, errors
-of Ng's scheme average out, and little is left to improve.
+so that rho B_f A_f dx is the mass of the fluid between the two pressures along the axis, counted to the walls. A
+fluid and solids that move alike have no net outflow anywhere, whatever theta. A flow along a slanting wall has none
+only if theta = 0: different weights for the components of n would let it through. Hence theta = max(0, 1 - |N_t| /
+|N_a|), N_a and N_t being the normal's part along the axis and the rest. On disks and balls, whose walls slant
+everywhere but at a few places, the errors of Ng's scheme average out, and little is left to mend.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ LEAST_PART = 0.1
 
 @dataclass(frozen=True)
 class Walls:
-    """What surfaces let through, by facet corner: the net outflow of unknown ``slot`` is ``flux[:, i]`` times the
-    velocity along ``axis`` of the facet's corner i.
+    """What surfaces let through, by the corners of facets.
+
+    The net outflow of unknown ``slot`` is ``flux[:, i]`` times the velocity along ``axis`` of the facet's corner i.
 
     Attributes
     ----------

@@ -29,6 +29,8 @@ class Extras:
         Faces of split cells that touch this rank's unknowns: flat index in the local face array.
     below, above : ndarray of int, shape (n_links,)
         Global numbers of the unknowns that a part of the face joins; -1 beyond a side.
+    mine_below, mine_above : ndarray of bool, shape (n_links,)
+        Whether that unknown is this rank's, and not just its image in a ghost.
     openness : ndarray, shape (n_links,)
         That of the part, see ``cut``.
     """
@@ -40,6 +42,8 @@ class Extras:
     face: np.ndarray
     below: np.ndarray
     above: np.ndarray
+    mine_below: np.ndarray
+    mine_above: np.ndarray
     openness: np.ndarray
 
     def same(self, other: Extras | None) -> bool:
@@ -78,8 +82,7 @@ class Extras:
         columns = index.reshape(-1)[cells[order]][np.searchsorted(old[order], pattern.indices)]
         n_cells, n_rows = grid.layout.n_local, layout.n_local
         pocket = POCKET_DIAGONAL * 2.0 * c.sum()
-        linked = np.unique(np.concatenate((self.below, self.above))) - layout.start
-        linked = linked[(linked >= 0) & (linked < n_rows)]
+        linked = np.unique(np.concatenate((self.below[self.mine_below], self.above[self.mine_above]))) - layout.start
         # a cell that the grid's own faces leave alone is no pocket if it has links
         own = pattern.slot[linked[linked < n_cells], 0]
         values[own] = np.where(values[own] == pocket, 0.0, values[own])
@@ -89,12 +92,12 @@ class Extras:
         weight = c[self.axis] * self.openness
         gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
         i, j, v = [], [], []
-        for one, other in ((self.below, self.above), (self.above, self.below)):
-            mine = (one >= layout.start) & (one < layout.end)
+        ends = ((self.below, self.above, self.mine_below), (self.above, self.below, self.mine_above))
+        for one, other, mine in ends:
             i.append(one[mine] - layout.start)
             j.append(one[mine])
             v.append((gain * weight)[mine])
-            mine &= other >= 0
+            mine = mine & (other >= 0)
             i.append(one[mine] - layout.start)
             j.append(other[mine])
             v.append(-weight[mine])
@@ -111,8 +114,7 @@ class Extras:
         """Add minus the net outflow through the links to this rank's right-hand side."""
         v = self.at_faces(star)
         flux = areas[self.axis] * self.openness * v
-        for number, sign in ((self.below, -1.0), (self.above, 1.0)):
-            mine = (number >= layout.start) & (number < layout.end)
+        for number, mine, sign in ((self.below, self.mine_below, -1.0), (self.above, self.mine_above, 1.0)):
             np.add.at(out, number[mine] - layout.start, sign * flux[mine])
 
     def at_faces(self, arrays: list[np.ndarray]) -> np.ndarray:

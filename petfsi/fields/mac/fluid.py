@@ -178,7 +178,7 @@ class MacFluid(FluidField):
             self._kinds_changed()
 
     def cut(self, points: np.ndarray, facets: np.ndarray) -> tuple[Walls, Wet]:
-        """Take over which parts of cells and faces a surface covers; return what it lets through, and bears. Collective.
+        """Take over what a surface covers of cells and faces; return what it lets through, and bears. Collective.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class MacFluid(FluidField):
             volume = self.grid.to_vec(self._active).astype(float)
         else:
             volume = self.grid.to_vec(self.volume)
-        if self.extras is not None:
+        if self.extras is not None and self.volume is not None:
             whole = self.volume.copy()
             np.subtract.at(whole.reshape(-1), self.extras.cell, self.extras.volume)
             volume = np.concatenate((self.grid.to_vec(whole), self.extras.volume))
@@ -298,7 +298,9 @@ class MacFluid(FluidField):
         if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
             buoyancy = self.scene.fluid.smoke.buoyancy
         gravity = np.array([float(g(t=time)) for g in self._gravity])
-        self._forces = budget.Forces.of(gravity, self.weight is None, buoyancy, smoke)
+        self._forces = budget.Forces.of(
+            gravity, [self.weight is None or p for p in self.grid.periodic], buoyancy, smoke
+        )
         if self.weight is not None:
             self.weight.at(time)
             self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
@@ -310,7 +312,7 @@ class MacFluid(FluidField):
                 self.boundary_velocity[axis],
                 kind,
                 kinds.STEP[axis],
-                dv if self.weight is None else 0.0,
+                dv if self.weight is None or self.grid.periodic[axis] else 0.0,
                 self.pressure if smoke is None else smoke,
                 -buoyancy * dv,
                 self._part(axis),

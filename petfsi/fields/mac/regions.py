@@ -161,7 +161,7 @@ def _extra_pairs(
     grid: MacGrid, labels: np.ndarray, of_unknown: np.ndarray, layout: Layout, index: np.ndarray, extras: Extras,
     is_open: np.ndarray, offset: int,
 ) -> np.ndarray:  # fmt: skip
-    """Return the label pairs that the links of split cells join, and note which labels reach an open side. Collective."""
+    """Return the pairs of labels that split cells' links join; note which labels reach an open side. Collective."""
     numbers = np.concatenate(grid.comm.allgather(layout.start + np.arange(grid.layout.n_local, layout.n_local)))
     every = np.concatenate(grid.comm.allgather(of_unknown[grid.layout.n_local :]))
     ends = []

@@ -302,7 +302,8 @@ class MidpointTransport(Transport):
         self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
     ) -> Faces:
         """Return the velocity at the step's end. Collective."""
-        pairs = zip(solved, self.solved(velocity), strict=True)
+        middle = self.past["velocity_middle"] if self.past_dt else velocity
+        pairs = zip(solved, middle, strict=True)
         ahead = [self.scheme.ahead(w, before, dt, self.past_dt) for w, before in pairs]
         complete(ahead)
         given = [(k == kinds.WALL) | (k == kinds.SOLID_FACE) for k in kind]

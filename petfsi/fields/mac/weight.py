@@ -1,9 +1,9 @@
 """Gravity without spurious currents: the pressure of a fluid at rest is split off and integrated exactly.
 
-With x_0 the upper corner of the grid, p = p' + rho g . (x - x_0). Gravity then drives nothing inside the fluid; it acts
-through open sides, where p = 0 means p' = -rho g . (x - x_0), and through walls, where the force of the second part is an
-exact integral over facets. A fluid at rest has p' constant, whatever cuts the grid, and buoyancy is that of the volume
-which the surface encloses.
+With x_0 the upper corner of the grid, p = p' + rho g . (x - x_0). Gravity then drives nothing inside the fluid; it
+acts through open sides, where p = 0 means p' = -rho g . (x - x_0), and through walls, where the force of the second
+part is an exact integral over facets. A fluid at rest has p' constant, whatever cuts the grid, and buoyancy is that
+of the volume which the surface encloses.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ class Weight:
         self.gradient = np.zeros(grid.dim)
 
     def at(self, time: float) -> None:
-        """Take gravity at a time."""
-        self.gradient = self.density * np.array([float(g(t=time)) for g in self._gravity])
+        """Take gravity at a time; nothing bears it along a periodic axis, where it stays a force on the fluid."""
+        borne = ~np.array(self.grid.periodic[: self.grid.dim])
+        self.gradient = self.density * np.array([float(g(t=time)) for g in self._gravity]) * borne
 
     def pressure(self) -> np.ndarray:
         """Return rho g . (x - x_0) in all local cells, Pa."""

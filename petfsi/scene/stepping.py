@@ -1,0 +1,71 @@
+"""The steps of a run: how long each one is, and when there are enough."""
+
+from __future__ import annotations
+
+import math
+
+from petfsi.scene.expressions import Expression, ExpressionError
+from petfsi.scene.schema import Time
+
+#: What may be missing to the run's end, in steps.
+SLACK = 1e-6
+#: The shortest step, over the run's length: shorter ones would be lost in the round-off of the time.
+SHORTEST = 1e-12
+
+
+class Stepping:
+    """The scene's ``time`` at work.
+
+    Steps are taken until the end is reached, or missed by ``SLACK`` of the last one; none is shortened, so the last
+    one may reach beyond.
+
+    Attributes
+    ----------
+    constant : bool
+        Whether all steps have the same length.
+    """
+
+    def __init__(self, time: Time) -> None:
+        self.end = time.end
+        self._dt = Expression(time.dt, ("t",), key="time.dt")
+        self.constant = self._dt.is_constant
+
+    def length(self, t: float) -> float:
+        """Return the length of the step that begins at t, s.
+
+        Raises
+        ------
+        ExpressionError
+            If it is not finite, zero, negative, or no more than round-off.
+        """
+        dt = float(self._dt(t=t))
+        if dt > (0.0 if self.constant else SHORTEST * self.end):
+            return dt
+        at = "" if self.constant else f"is {dt:g} at t = {t:g}; "
+        wanted = f"must be greater than {SHORTEST:g} of time.end" if dt > 0 else "must be greater than 0 (s)"
+        raise ExpressionError(f"time.dt = {self._dt.source!r}", at + wanted)
+
+    def after(self, step: int, t: float, dt: float) -> float:
+        """Return the time after a step of length dt that began at t and ends as number ``step``, s."""
+        # a multiple has one rounding, a sum as many as terms
+        return step * dt if self.constant else t + dt
+
+    def finished(self, t: float, dt: float) -> bool:
+        """Say whether t, reached by a step of length dt, is the end."""
+        return t >= self.end - SLACK * dt
+
+    def count(self, most: int) -> int | None:
+        """Return how many steps there are; None if they differ and are more than ``most``, or one is impossible."""
+        step, t = 0, 0.0
+        try:
+            dt = self.length(t)
+            if self.constant:
+                return max(1, math.ceil(self.end / dt - SLACK))
+            while step == 0 or not self.finished(t, dt):
+                if step == most:
+                    return None
+                dt = self.length(t)
+                step, t = step + 1, self.after(step + 1, t, dt)
+        except ExpressionError:
+            return None
+        return step
