@@ -95,7 +95,9 @@ def _match(split, below, above, n_below, n_above):
     table = np.zeros((n_below, n_above))
     b, e = split.start[below], split.start[above]
     n = split.start[below + 1] - b
-    same = n == split.start[above + 1] - e and np.array_equal(split.key[b : b + n], split.key[e : e + n])
+    same = n == split.start[above + 1] - e
+    for i in range(n if same else 0):
+        same = same and split.key[b + i] == split.key[e + i]
     if same:
         for i in range(n):
             table[split.piece[b + i], split.piece[e + i]] += 0.5 * (split.area[b + i] + split.area[e + i])

@@ -91,7 +91,12 @@ def _enlarged(room):
     """Return twice the room, with what is in it."""
     n = len(room[0])
     more = _room(2 * n, room[4].shape[1] - 1)
-    more[0][:n], more[1][:n], more[2][:n], more[3][:n], more[4][:n] = room
+    for i in range(n):  # loops: they compile in a tenth of the time that slices take
+        more[0][i], more[1][i], more[2][i] = room[0][i], room[1][i], room[2][i]
+        for a in range(room[3].shape[1]):
+            more[3][i, a] = room[3][i, a]
+        for a in range(room[4].shape[1]):
+            more[4][i, a] = room[4][i, a]
     return more
 
 
@@ -112,7 +117,7 @@ def _clip_3d(x, facets, frame, sums0, sums1, sums2):
     ny, nz = hi[1] - lo[1], hi[2] - lo[2]
     room = _room(4 * len(facets) + 64, 3)
     part, tags = np.empty((4, MOST, 6)), np.empty((4, MOST), np.int64)
-    at, integral, vector = np.empty(3, np.int64), np.empty(12), np.empty(4)
+    at = np.empty(3, np.int64)
     count = 0
     for f in range(len(facets)):
         load_facet(x, facets[f], part[0], tags[0])
@@ -136,6 +141,9 @@ def _clip_3d(x, facets, frame, sums0, sums1, sums2):
                         c, o = 3, clip_polygon(part[b], tags[b], m, 2, _low(k, lo[2]), k + 1.0, part[3], tags[3])
                     if o < 3:
                         continue
+                    if count == len(room[0]):
+                        room = _enlarged(room)
+                    integral, vector = room[3][count], room[4][count]
                     at[0], at[1], at[2] = i, j, k
                     _measure_polygon(part[c], o, at, frame.dx, frame.normals[f], integral, vector)
                     # what lies below the box has its area added to the first entry of its row
@@ -148,10 +156,8 @@ def _clip_3d(x, facets, frame, sums0, sums1, sums2):
                         sums2[i_, j_, k_ + 1] += vector[2]
                     if i_ < 0 or j_ < 0 or k_ < 0:
                         continue
-                    if count == len(room[0]):
-                        room = _enlarged(room)
                     room[0][count], room[1][count] = f, (i_ * ny + j_) * nz + k_
-                    room[2][count], room[3][count], room[4][count] = _own_edges(tags[c], o), integral, vector
+                    room[2][count] = _own_edges(tags[c], o)
                     count += 1
     return room[0][:count], room[1][:count], room[2][:count], room[3][:count], room[4][:count]
 
@@ -162,7 +168,7 @@ def _clip_2d(x, facets, frame, sums0, sums1):
     lo, hi = frame.lo, frame.hi
     room = _room(4 * len(facets) + 64, 2)
     part, tags = np.empty((3, 2, 4)), np.empty((3, 2), np.int64)
-    at, integral, vector = np.empty(2, np.int64), np.empty(6), np.empty(3)
+    at = np.empty(2, np.int64)
     count = 0
     for f in range(len(facets)):
         load_facet(x, facets[f], part[0], tags[0])
@@ -176,6 +182,9 @@ def _clip_2d(x, facets, frame, sums0, sums1):
             for j in range(max(j0, lo[1]) if i < lo[0] else j0, j1):
                 if clip_segment(part[1], tags[1], 1, _low(j, lo[1]), j + 1.0, part[2], tags[2]) == 0:
                     continue
+                if count == len(room[0]):
+                    room = _enlarged(room)
+                integral, vector = room[3][count], room[4][count]
                 at[0], at[1] = i, j
                 _measure_segment(part[2], at, frame.dx, frame.normals[f], integral, vector)
                 i_, j_ = i - lo[0], j - lo[1]
@@ -185,10 +194,8 @@ def _clip_2d(x, facets, frame, sums0, sums1):
                     sums1[i_, j_ + 1] += vector[1]
                 if i_ < 0 or j_ < 0:
                     continue
-                if count == len(room[0]):
-                    room = _enlarged(room)
                 room[0][count], room[1][count] = f, i_ * (hi[1] - lo[1]) + j_
-                room[2][count], room[3][count], room[4][count] = _own_edges(tags[2], 2), integral, vector
+                room[2][count] = _own_edges(tags[2], 2)
                 count += 1
     return room[0][:count], room[1][:count], room[2][:count], room[3][:count], room[4][:count]
 
@@ -219,7 +226,10 @@ def _measure_polygon(points, n, at, dx, normal, integral, vector):
 
     The points are moved to be about the cell's centre.
     """
-    integral[:], vector[:] = 0.0, 0.0
+    for a in range(4):
+        vector[a] = 0.0
+    for a in range(12):
+        integral[a] = 0.0
     for i in range(n):
         for a in range(3):
             points[i, a] -= at[a] + 0.5

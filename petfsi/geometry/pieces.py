@@ -92,7 +92,17 @@ def find_pieces(
         side = (np.arange(dim) == face // 2) * (face % 2)
         openings[:, face] = opening[face // 2][tuple(index + side[:, None])]
     split, patch_piece, extras = split_cells(
-        x, facets, beyond, box, patches.facet, patches.image, patches.cell, parts, patches.vectors, ranges, openings
+        x,
+        facets,
+        beyond if dim == 3 else None,
+        box,
+        patches.facet,
+        patches.image,
+        patches.cell,
+        parts,
+        patches.vectors,
+        ranges,
+        openings,
     )
     place = np.column_stack(np.unravel_index(split.cell, box.shape)).reshape(-1, dim) + box.lo
     stride = np.append(np.cumprod(box.shape[:0:-1])[::-1], 1)
@@ -278,6 +288,8 @@ def split_cells(x, facets, beyond, box, facet, image, cell, parts, vectors, rang
 
     Parameters
     ----------
+    beyond : ndarray of int, shape (m, 3)
+        As ``neighbours`` returns it; None in 2D.
     parts : ndarray of int, shape (n,)
         As ``connected_parts`` returns them.
     ranges : ndarray of int, shape (k, 2)
@@ -298,7 +310,7 @@ def split_cells(x, facets, beyond, box, facet, image, cell, parts, vectors, rang
         first, last = ranges[r]
         part, n_parts = _count_parts(parts[first:last])
         at = _places(cell[first], box)
-        if dim == 2:
+        if beyond is None:  # told apart when compiled: the other walk is not
             parent, state, elements, key, good = walk_2d(
                 x, facets, at, facet[first:last], image[first:last], part, n_parts, openings[r]
             )

@@ -92,15 +92,17 @@ def clip_segment(points, tags, axis, low, high, out, out_tags):
         Two coordinates and two weights of the facet's corners a point.
     tags, out_tags : ndarray of int, shape (2,)
     """
-    zones = (_zone(points[0, axis], low, high), _zone(points[1, axis], low, high))
-    if zones[0] == zones[1] != 0:
-        return 0
     for i in range(2):
-        if zones[i] == 0:
-            out[i], out_tags[i] = points[i], tags[i]
+        zone = _zone(points[i, axis], low, high)
+        if zone == 0:
+            for a in range(4):
+                out[i, a] = points[i, a]
+            out_tags[i] = tags[i]
+        elif zone == _zone(points[1 - i, axis], low, high):
+            return 0
         else:
-            _crossing(points, 0, 1, axis, low if zones[i] < 0 else high, out, i)
-            out_tags[i] = PLANE + 2 * axis + (zones[i] > 0)
+            _crossing(points, 0, 1, axis, low if zone < 0 else high, out, i)
+            out_tags[i] = PLANE + 2 * axis + (zone > 0)
     return 2
 
 
@@ -158,8 +160,10 @@ def clip_to_cell(x, corners, cell, points, tags):
             n = clip_segment(points[0], tags[0], axis, low, low + 1.0, points[1], tags[1])
         if n == 0:
             return 0
-        points[0, :n] = points[1, :n]
-        tags[0, :n] = tags[1, :n]
+        for i in range(n):
+            for a in range(2 * dim):
+                points[0, i, a] = points[1, i, a]
+            tags[0, i] = tags[1, i]
     for i in range(n):
         for axis in range(dim):
             points[1, i, axis] -= cell[axis] + 0.5

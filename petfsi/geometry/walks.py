@@ -87,6 +87,14 @@ def _corners(dim, line):
 
 
 @njit(cache=True)
+def _comes_before(crossings, c, d):
+    """Return whether a crossing has a lower line, or one as high and a lower position."""
+    if crossings[c, 0] != crossings[d, 0]:
+        return crossings[c, 0] < crossings[d, 0]
+    return crossings[c, 1] < crossings[d, 1]
+
+
+@njit(cache=True)
 def find_lines(dim, crossings, open_corner, n_parts, parent):
     """Return the lines and join what their open stretches join.
 
@@ -101,12 +109,17 @@ def find_lines(dim, crossings, open_corner, n_parts, parent):
     n_lines = dim * (1 << (dim - 1))
     n = len(crossings)
     start = np.zeros(n_lines + 1, np.int64)
+    order, position = np.empty(n, np.int64), np.empty(n)
     for c in range(n):
-        start[int(crossings[c, 0]) + 1] += 1
-    start = np.cumsum(start)
-    order = np.argsort(crossings[:, 1], kind="mergesort")
-    order = order[np.argsort(crossings[order, 0], kind="mergesort")]
-    position = crossings[order, 1]
+        for line in range(int(crossings[c, 0]), n_lines):
+            start[line + 1] += 1
+        i = c
+        while i > 0 and _comes_before(crossings, c, order[i - 1]):
+            order[i] = order[i - 1]
+            i -= 1
+        order[i] = c
+    for c in range(n):
+        position[c] = crossings[order[c], 1]
     node, length = np.full(n + n_lines, -1), np.zeros(n + n_lines)
     state = np.full(1 << dim, -1)
     for line in range(n_lines):
@@ -134,7 +147,8 @@ def find_lines(dim, crossings, open_corner, n_parts, parent):
             else:
                 depth -= int(crossings[order[c], 3])
     if n == 0:
-        state[:] = open_corner
+        for corner in range(1 << dim):
+            state[corner] = open_corner
     _follow_whole_lines(dim, start, state, n_parts, parent, node, length)
     return Lines(start, position, node, length), state
 
@@ -197,7 +211,7 @@ def walk_2d(x, facets, cells, facet, image, part, n_parts, opening):
     for p in range(n):
         clip_to_cell(x, facets[facet[p]], cells[image[p]], points, tags)
         for i in range(2):
-            ends[p, i] = points[1, i, :2]
+            ends[p, i, 0], ends[p, i, 1] = points[1, i, 0], points[1, i, 1]
             if tags[1, i] >= PLANE:
                 axis, side = (tags[1, i] - PLANE) // 2, (tags[1, i] - PLANE) % 2
                 # fluid is to the right of the way out of the cell
@@ -226,22 +240,22 @@ def walk_2d(x, facets, cells, facet, image, part, n_parts, opening):
 @njit(cache=True)
 def _surround_2d(ends, part, s, lines, parent):
     """Join a closed curve with the fluid around it, if that is on its outside; False if none is found."""
-    area, top = 0.0, np.array([-np.inf, 0.0])
+    area, u, v = 0.0, -np.inf, 0.0
     for p in range(len(part)):
         if part[p] == s:
             area += ends[p, 0, 0] * ends[p, 1, 1] - ends[p, 1, 0] * ends[p, 0, 1]
-            if ends[p, 0, 0] > top[0]:
-                top[:] = ends[p, 0]
+            if ends[p, 0, 0] > u:
+                u, v = ends[p, 0, 0], ends[p, 0, 1]
     if area <= 0.0:
         return True
     node, nearest = -1, np.inf
     for p in range(len(part)):
         if part[p] != s:
-            u = hit(ends[p], top[1])
-            if top[0] <= u < nearest:
-                node, nearest = part[p], u
+            at = hit(ends[p], v)
+            if u <= at < nearest:
+                node, nearest = part[p], at
     if node < 0:
-        node = stretch(lines, line_of(2, 1, 0, 1, 0), top[1])
+        node = stretch(lines, line_of(2, 1, 0, 1, 0), v)
     if node >= 0:
         join(parent, s, node)
     return node >= 0

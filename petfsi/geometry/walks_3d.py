@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from petfsi.geometry.slabs import MOST, PLANE, clip_to_cell
-from petfsi.geometry.walks import find_lines, hit, join, line_of, position_of, stretch
+from petfsi.geometry.walks import find_lines, hit, join, line_of, stretch
 
 
 class Traces(NamedTuple):
@@ -105,10 +105,11 @@ def _height(polygon, height):
     height[0], height[3] = 0.0, -np.inf
     for i in range(len(polygon)):
         if polygon[i, 2] > height[3]:
-            height[1:] = polygon[i]
+            height[1], height[2], height[3] = polygon[i, 0], polygon[i, 1], polygon[i, 2]
     for i in range(1, len(polygon) - 1):
-        b, c = polygon[i] - polygon[0], polygon[i + 1] - polygon[0]
-        height[0] += (b[0] * c[1] - b[1] * c[0]) * (polygon[0, 2] + polygon[i, 2] + polygon[i + 1, 2]) / 6.0
+        twice = (polygon[i, 0] - polygon[0, 0]) * (polygon[i + 1, 1] - polygon[0, 1])
+        twice -= (polygon[i, 1] - polygon[0, 1]) * (polygon[i + 1, 0] - polygon[0, 0])
+        height[0] += twice * (polygon[0, 2] + polygon[i, 2] + polygon[i + 1, 2]) / 6.0
 
 
 @njit(cache=True)
@@ -149,11 +150,11 @@ def _join_loops(face, facet, image, part, traces, neighbours, lines, parent):
     for loop in range(n_open, number):
         if area[loop] >= 0.0:
             continue
-        top = np.array([-np.inf, 0.0])
+        u, v = -np.inf, 0.0
         for p in range(n):
-            if traces.chain[p, face] == loop and traces.ends[p, face, 0, 0] > top[0]:
-                top[:] = traces.ends[p, face, 0]
-        node = _beside(face, top, loop, part, traces, lines)
+            if traces.chain[p, face] == loop and traces.ends[p, face, 0, 0] > u:
+                u, v = traces.ends[p, face, 0, 0], traces.ends[p, face, 0, 1]
+        node = _beside(face, u, v, loop, part, traces, lines)
         if node < 0:
             return False
         join(parent, part[first[loop]], node)
@@ -163,24 +164,29 @@ def _join_loops(face, facet, image, part, traces, neighbours, lines, parent):
 @njit(cache=True)
 def _patch(facet, image, wanted, wanted_image):
     """Return the number of the patch of a facet and image, -1 if there is none."""
-    low, high = np.searchsorted(image, wanted_image), np.searchsorted(image, wanted_image, side="right")
-    i = position_of(facet[low:high], wanted)
-    return low + i if i >= 0 else -1
+    low, high = 0, len(facet)
+    while low < high:
+        i = (low + high) // 2
+        if image[i] < wanted_image or (image[i] == wanted_image and facet[i] < wanted):
+            low = i + 1
+        else:
+            high = i
+    return low if low < len(facet) and image[low] == wanted_image and facet[low] == wanted else -1
 
 
 @njit(cache=True)
-def _beside(face, at, loop, part, traces, lines):
+def _beside(face, u, v, loop, part, traces, lines):
     """Return the node whose opening on a face holds a point: what a ray along the first coordinate meets."""
     node, nearest = -1, np.inf
     for p in range(len(part)):
         if traces.after[p, face] >= 0 and traces.chain[p, face] != loop:
-            u = hit(traces.ends[p, face], at[1])
-            if at[0] <= u < nearest:
-                node, nearest = part[p], u
+            at = hit(traces.ends[p, face], v)
+            if u <= at < nearest:
+                node, nearest = part[p], at
     if node >= 0:
         return node
     axis = face // 2
-    return stretch(lines, line_of(3, (axis + 2) % 3, (axis + 1) % 3, 1, face % 2), at[1])
+    return stretch(lines, line_of(3, (axis + 2) % 3, (axis + 1) % 3, 1, face % 2), v)
 
 
 @njit(cache=True)
@@ -191,7 +197,7 @@ def _surround_3d(x, facets, cells, facet, image, part, s, heights, traces, lines
         if part[p] == s:
             volume += heights[p, 0]
             if heights[p, 3] > top[2]:
-                top[:] = heights[p, 1:]
+                top[0], top[1], top[2] = heights[p, 1], heights[p, 2], heights[p, 3]
     if volume <= 0.0:
         return True
     points, tags = np.empty((2, MOST, 6)), np.empty((2, MOST), np.int64)
@@ -203,7 +209,7 @@ def _surround_3d(x, facets, cells, facet, image, part, s, heights, traces, lines
             if top[2] <= z < nearest:
                 node, nearest = part[p], z
     if node < 0:
-        node = _beside(5, top[:2], -1, part, traces, lines)
+        node = _beside(5, top[0], top[1], -1, part, traces, lines)
     if node >= 0:
         join(parent, s, node)
     return node >= 0
