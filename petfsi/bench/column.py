@@ -146,7 +146,7 @@ class Column:
         return (dt, *theory.fit_damped_sinusoid(dt * np.arange(len(y)), y, *guess))
 
     def energies(self, comm: MPI.Comm, per_period: int, steps: int) -> np.ndarray:
-        """Return the kinetic and elastic energy of layer and water at the start and after each step, J/m. Collective."""
+        """Return the kinetic and elastic energy of layer and water at the start and after steps, J/m. Collective."""
         with simulation(comm, self.scene(comm, self.period / per_period), MONOLITHIC) as sim:
             values = [_energy(sim)]
             for _ in range(steps):
