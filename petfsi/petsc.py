@@ -73,6 +73,14 @@ def set_csr(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, values: np.
         mat.assemble()
 
 
+def add_to_composite(composite: PETSc.Mat, part: PETSc.Mat) -> None:
+    """Add a matrix to the sum that a matrix of type composite stands for; petsc4py has no word for it. Collective."""
+    add = _library().MatCompositeAddMat
+    add.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+    if add(composite.handle, part.handle):
+        raise PETSc.Error
+
+
 def gather_triplets(
     comm: MPI.Comm, rows: Layout, i: np.ndarray, j: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

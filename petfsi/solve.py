@@ -6,12 +6,17 @@ import sysconfig
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
+from weakref import finalize
 
 import numpy as np
 from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.errors import InputError, SolveError
+from petfsi.fields.base import FluidField
+from petfsi.multigrid import Hierarchy
+from petfsi.pressure_solver import PressureSolver
 from petfsi.system import System
 
 #: The solve of a step.
@@ -131,6 +136,8 @@ class Solver:
         self.fixed_iterations = options.getString("ksp_convergence_test", "default") == "skip"
         self._ksp: PETSc.KSP | None = None
         self._monolith: PETSc.Mat | None = None
+        self._pressure: PressureSolver | None = None
+        self._hierarchy: Hierarchy | None = None
         self._inner_iterations = 0
 
     def set_up(self) -> None:
@@ -138,8 +145,12 @@ class Solver:
         try:
             if self._ksp is None:
                 self._ksp = self._create()
+                # what PETSc runs in Python must be gone before Python is
+                self._release = finalize(self, _release, self._ksp, self._pressure)
             elif self.converts:
                 self._ksp.setOperators(self._convert())
+            elif self._pressure is not None:
+                self._pressure.refresh(self._inner_iterations)
             self._ksp.setUp()
         except PETSc.Error as error:
             raise InputError(_option_story(self.prefix, error)) from None
@@ -152,11 +163,26 @@ class Solver:
         ksp.setFromOptions()
         if system.index_sets and ksp.getPC().getType() == PETSc.PC.Type.FIELDSPLIT:
             ksp.getPC().setFieldSplitIS(*system.index_sets)  # heard only between setFromOptions and setUp
+        fluid = next((field for field in system.fields if isinstance(field, FluidField)), None)
+        if fluid is not None and not self.converts:
+            self._pressure = PressureSolver(system, ksp, fluid)
+            if not system.index_sets:
+                self._pressure.connect(ksp, self._grids(fluid))
         ksp.setUp()
+        if self._pressure is not None and self._sub_solvers(ksp):
+            self._pressure.connect(self._sub_solvers(ksp)[-1], self._grids(fluid))
         for sub in self._sub_solvers(ksp):
             if sub.getType() != PETSc.KSP.Type.PREONLY:
                 sub.setMonitor(self._count)
         return ksp
+
+    def _grids(self, fluid: Any) -> Hierarchy | None:
+        """Return the hierarchy of the fluid's grids, made once per run; None if it has no grid. Collective."""
+        if getattr(fluid, "grid", None) is not None:
+            if self._hierarchy is None:
+                self._hierarchy = Hierarchy(fluid)
+            self._hierarchy.follow(fluid)
+        return self._hierarchy
 
     def _convert(self) -> PETSc.Mat:
         if self._monolith is not None:
@@ -175,8 +201,8 @@ class Solver:
     def reset(self) -> None:
         """Forget everything but the options, so that the next solve is that of a fresh process. Collective."""
         if self._ksp is not None:
-            self._ksp.destroy()
-            self._ksp = None
+            self._release()
+            self._ksp = self._pressure = None
 
     def adopt(self, system: System) -> None:
         """Solve another system of the same fields from now on. Collective."""
@@ -201,6 +227,8 @@ class Solver:
         ksp, system = self._ksp, self.system
         assert ksp is not None
         self._inner_iterations = 0
+        if self._pressure is not None and ksp.getType() != PETSc.KSP.Type.PREONLY:
+            self._pressure.aim(ksp.getTolerances()[0] * system.rhs.norm())
         try:
             ksp.solve(system.rhs, system.solution)
         except PETSc.Error as error:
@@ -265,6 +293,12 @@ class Solver:
                 lines.append(f"option -{name}: no solver of this scene reads it{hint}")
             raise InputError("\n".join(lines))
         return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
+
+
+def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
+    if pressure is not None:
+        pressure.release()
+    ksp.destroy()
 
 
 #: How the names of options end that mean nothing without a value.

@@ -20,12 +20,15 @@ class Coupling(ABC):
         Grows whenever the pattern of a block changes; the same on all ranks.
     touched : ndarray of bool or None
         This rank's unknowns of the fluid that the coupling acts on; None is none.
+    symmetric : bool
+        Whether D1 H = J^T, so that iterations for symmetric systems may be used.
     n_coupled, n_assembled : int
         How often the transfer operators were made and the blocks filled; a step that changes nothing adds nothing.
     """
 
     blocks: dict[tuple[str, str], PETSc.Mat]
     touched: np.ndarray | None = None
+    symmetric: bool = False
     pattern_version: int = 0
     n_coupled: int = 0
     n_assembled: int = 0

@@ -27,6 +27,8 @@ class CutCellCoupling(Coupling):
     the solver's tolerance, and the system is symmetric quasi-definite.
     """
 
+    symmetric = True
+
     def __init__(self, fluid: MacFluid, solid: SolidField, spec: schema.Coupling) -> None:
         self.fluid, self.solid = fluid, solid
         self.comm: MPI.Comm = fluid.comm

@@ -152,6 +152,13 @@ class SolidField(Field):
         """Measure rows against this mass, kg: that of a fluid cell."""
 
     @abstractmethod
+    def light_motions(self, degree: int, density: float, most: int) -> np.ndarray:
+        """Return polynomial motions of each body no denser than ``density`` (kg/m^3), shape (n, layout.n_local).
+
+        Of the given degree, or of a smaller one so that there are at most ``most`` of them; else none.
+        """
+
+    @abstractmethod
     def surface(self) -> Surface:
         """Return the wet surface, the same on every rank."""
 

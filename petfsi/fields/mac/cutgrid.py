@@ -13,7 +13,7 @@ from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, join, patch_
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.sides import Surroundings
-from petfsi.geometry.clipping import Lattice, cut
+from petfsi.geometry.clipping import CutCells, Lattice, cut
 from petfsi.petsc import IntType, Layout
 
 
@@ -87,8 +87,12 @@ class CutGrid:
         self._flat_faces = [
             self._part(np.arange(int(np.prod(grid.shape(a)))).reshape(grid.shape(a)), a).reshape(-1) for a in range(dim)
         ]
+        own = np.zeros(grid.shape(None), dtype=bool)
+        own[grid.owned(None)] = True
+        self._own = own.reshape(-1)[self._flat]  # a ghost may stand for a cell of this rank: only that one counts
+        self._covered = np.zeros(grid.shape(None), dtype=bool)
         static = self.cut(np.zeros((0, dim)), np.zeros((0, dim), dtype=np.int64))
-        self.covered = static.cell_kind != kinds.FLUID
+        self._covered = static.cell_kind == kinds.SOLID
 
     def _part(self, array: np.ndarray, axis: int | None) -> np.ndarray:
         """Return the box's part of a local array of faces of ``axis`` (cells: None), without the third axis in 2D."""
@@ -110,36 +114,34 @@ class CutGrid:
         found = cut(*every, self.lattice, self.base)
         links, walls = join(found, self.shape, grid.dx, self._sides, len(facets))
         links = self._without_walls(links)
-        openness = []
-        split = []
-        for a in range(grid.dim):
-            whole = grid.zeros_faces(a)
-            part = self._part(whole, a)
-            part[...] = found.open[a]
-            plain = (links.axis == a) & ~links.split
-            whole.reshape(-1)[self._flat_faces[a][links.face[plain]]] = links.openness[plain]
-            torn = np.unique(self._flat_faces[a][links.face[(links.axis == a) & links.split]])
-            whole.reshape(-1)[torn] = 0.0
-            grid.exchange_faces(a, whole)
-            openness.append(whole)
-            split.append(torn)
+        openness, split = self._openness(found, links)
         volume = grid.zeros_cells()
         self._part(volume, None)[...] = found.volume
         grid.exchange_cells(volume)
         cell_kind, face_kind = self._kinds(openness, split)
-        layout, index, extras, slots = self._number(found, links)
-        numbers = slots[walls.slot]
-        # a ghost may stand for a cell of this rank itself, which has its own entries
-        own = np.zeros(grid.shape(None), dtype=bool)
-        own[grid.owned(None)] = True
-        own = own.reshape(-1)[self._flat]
-        solved = own & (cell_kind.reshape(-1)[self._flat] == kinds.FLUID)
-        solved = np.concatenate((solved, own[found.extra_cell]))
+        layout, index, extras, numbers = self._number(found, links)
+        active = cell_kind.reshape(-1)[self._flat] == kinds.FLUID
+        solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
-        walls = Walls(walls.facet[used], walls.axis[used], numbers[used], walls.flux[used])
+        walls = Walls(walls.facet[used], walls.axis[used], numbers[walls.slot[used]], walls.flux[used])
         patches = np.flatnonzero(solved[patch_slots(found, len(self._flat))] & (found.facet < len(facets)))
         wet = first_moments(found, patches, self._centres(found.cell[patches]))
         return Openings(cell_kind, face_kind, openness, volume, layout, index, extras, walls, wet)
+
+    def _openness(self, found: CutCells, links: Links) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the openness of local faces by axis, zero where split, and which are split (flat). Collective."""
+        openness, split = [], []
+        for a in range(self.grid.dim):
+            whole = self.grid.zeros_faces(a)
+            self._part(whole, a)[...] = found.open[a]
+            flat, plain = whole.reshape(-1), (links.axis == a) & ~links.split
+            flat[self._flat_faces[a][links.face[plain]]] = links.openness[plain]
+            torn = np.unique(self._flat_faces[a][links.face[(links.axis == a) & links.split]])
+            flat[torn] = 0.0
+            self.grid.exchange_faces(a, whole)
+            openness.append(whole)
+            split.append(torn)
+        return openness, split
 
     def _centres(self, cell: np.ndarray) -> np.ndarray:
         """Return the centres of cells of the box from the upper corner of the grid, (n, dim)."""
@@ -168,63 +170,44 @@ class CutGrid:
         cell_kind = surroundings.cell_kind.copy()
         _cell_kinds(*three(face_kind), grid.dim == 2, cell_kind)
         grid.exchange_cells(cell_kind)
-        if hasattr(self, "covered"):
-            cell_kind[(cell_kind == kinds.SOLID) & self.covered] = kinds.OBSTACLE
+        cell_kind[(cell_kind == kinds.SOLID) & self._covered] = kinds.OBSTACLE
         return cell_kind, face_kind
 
-    def _number(self, found, links: Links) -> tuple[Layout, np.ndarray, Extras | None, np.ndarray]:
+    def _number(self, found: CutCells, links: Links) -> tuple[Layout, np.ndarray, Extras | None, np.ndarray]:
         """Return layout, cell numbers, extras, and the global number of each slot. Collective."""
-        grid, comm = self.grid, self.grid.comm
-        n_extra = comm.allreduce(len(found.extra_cell), op=MPI.MAX)
-        if n_extra == 0 and comm.allreduce(bool(links.split.any()), op=MPI.LOR) is False:
-            index = grid.index
-            return grid.layout, index, None, index.reshape(-1)[self._flat]
+        grid = self.grid
+        if not grid.comm.allreduce(bool(len(found.extra_cell) or links.split.any()), op=MPI.LOR):
+            return grid.layout, grid.index, None, grid.index.reshape(-1)[self._flat]
         local = self._flat[found.extra_cell]
-        owned = np.zeros(grid.shape(None), dtype=bool)
-        owned[grid.owned(None)] = True
-        mine = np.flatnonzero(owned.reshape(-1)[local])
-        layout = Layout.of(comm, grid.layout.n_local + len(mine))
+        mine = np.flatnonzero(self._own[found.extra_cell])
+        layout = Layout.of(grid.comm, grid.layout.n_local + len(mine))
         index = np.full(grid.shape(None), -1, dtype=IntType)
         grid.from_vec(layout.start + np.arange(grid.layout.n_local, dtype=IntType), index)
         grid.exchange_cells(index)
         # whose ghost cell is split finds the owner's number by the cell's and the piece's
-        key = np.stack((index.reshape(-1)[local], found.extra_piece), axis=1).astype(np.int64)
-        numbers = layout.start + grid.layout.n_local + np.arange(len(mine))
-        table = dict(
-            (tuple(k), n)
-            for keys, values in comm.allgather((key[mine].tolist(), numbers.tolist()))
-            for k, n in zip(keys, values, strict=True)
-        )
-        extra = np.array([table[tuple(k)] for k in key.tolist()], dtype=np.int64)
-        slots = np.concatenate((index.reshape(-1)[self._flat].astype(np.int64), extra))
+        key = index.reshape(-1)[local].astype(np.int64) * (1 << 20) + found.extra_piece
+        own = layout.start + grid.layout.n_local + np.arange(len(mine), dtype=np.int64)
+        keys, every = (np.concatenate(grid.comm.allgather(part)) for part in (key[mine], own))
+        order = np.argsort(keys)
+        extra = every[order[np.searchsorted(keys[order], key)]]
+        numbers = np.concatenate((index.reshape(-1)[self._flat].astype(np.int64), extra))
+        pieces = local[mine], found.extra_piece[mine], found.extra_volume[mine]
+        return layout, index, Extras(*pieces, *self._split_links(links, numbers, found.extra_cell)), numbers
+
+    def _split_links(self, links: Links, numbers: np.ndarray, extra_cell: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return what ``Extras`` says of links, in an order that does not depend on how they were found."""
         torn = np.flatnonzero(links.split)
-        below, above = (np.where(s[torn] >= 0, slots[s[torn]], -1) for s in (links.below, links.above))
-        # a ghost may stand for a cell of this rank itself, whose own faces count
-        here = owned.reshape(-1)[np.concatenate((self._flat, local))]
-        mine_below, mine_above = ((s[torn] >= 0) & here[s[torn]] for s in (links.below, links.above))
+        own = np.concatenate((self._own, self._own[extra_cell]))
+        ends = links.below[torn], links.above[torn]
+        below, above = (np.where(slot >= 0, numbers[slot], -1) for slot in ends)
+        mine_below, mine_above = ((slot >= 0) & own[slot] for slot in ends)
+        axis, face = links.axis[torn], np.empty(len(torn), dtype=np.int64)
+        for a, faces in enumerate(self._flat_faces):
+            face[axis == a] = faces[links.face[torn[axis == a]]]
         use = np.flatnonzero(mine_below | mine_above)
-        face = np.empty(len(torn), dtype=np.int64)
-        for a in range(grid.dim):
-            at = links.axis[torn] == a
-            face[at] = self._flat_faces[a][links.face[torn[at]]]
-        order = use[np.lexsort((above[use], below[use], face[use], links.axis[torn[use]]))]
-        return (
-            layout,
-            index,
-            Extras(
-                local[mine],
-                found.extra_piece[mine],
-                found.extra_volume[mine],
-                links.axis[torn[order]],
-                face[order],
-                below[order],
-                above[order],
-                mine_below[order],
-                mine_above[order],
-                links.openness[torn[order]],
-            ),
-            slots,
-        )
+        order = use[np.lexsort((above[use], below[use], face[use], axis[use]))]
+        columns = (axis, face, below, above, mine_below, mine_above, links.openness[torn])
+        return tuple(column[order] for column in columns)
 
 
 @njit(cache=True)

@@ -179,6 +179,24 @@ class SimplexSolid(SolidField):
         """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``."""
         self._reference_mass = reference_mass
 
+    def light_motions(self, degree: int, density: float, most: int) -> np.ndarray:
+        """Return polynomial motions of each body no denser than ``density``, shape (n, layout.n_local). Collective."""
+        light = np.flatnonzero(self._elements.bodies.density <= density)
+        while degree >= 0 and len(light) * self.dim * len(_powers(self.dim, degree)) > most:
+            degree -= 1
+        if degree < 0 or not len(light):
+            return np.zeros((0, self.layout.n_local))
+        node_body = np.zeros(len(self._mesh.points), dtype=np.int64)
+        node_body[self._mesh.cells] = self._mesh.body[:, None]
+        x = self.reference / self.extent
+        x = x - self.comm.allreduce(x.sum(axis=0)) / (self.layout.n_global // self.dim)
+        motions = []
+        for body in light:
+            for powers in _powers(self.dim, degree):
+                shape = np.where(node_body[: len(x)] == body, np.prod(x**powers, axis=1), 0.0)
+                motions += [np.outer(shape, axis).ravel() for axis in np.eye(self.dim)]
+        return np.array(motions)
+
     def near_null_space(self) -> list[np.ndarray]:
         """Return the rigid motions about the origin of coordinates: translations, then rotations."""
         x, dim = self.reference, self.dim
@@ -308,6 +326,11 @@ class SimplexSolid(SolidField):
     def _rows(self, rows: np.ndarray) -> Slab:
         begin, _, n = self._slab
         return Slab(rows, (begin, 0), (n, self.dim))
+
+
+def _powers(dim: int, degree: int) -> list[tuple[int, ...]]:
+    """Return the exponents of all monomials up to a degree."""
+    return [p for p in np.ndindex(*(degree + 1,) * dim) if sum(p) <= degree]
 
 
 def _union(scene: Scene) -> SimplexMesh:

@@ -1,0 +1,287 @@
+"""Geometric multigrid for the pressure: what carries vectors between grids, and the operators of coarse grids.
+
+Cells are merged by twos along every axis. With Q the piecewise constant and P the (bi-, tri-) linear interpolation
+between cell centres, level by level,
+
+    corrections   x += P x_c             with P handed to PCMG,
+    fluxes        L_c = Q^T L Q / 2      open parts of faces are averaged, the distance between centres doubles,
+    walls         E_c = Q^T E Q          what moving walls let through (see ``schur``) adds up.
+
+Coarse operators keep the 5 or 7 points of L, so they cost next to nothing to make and to apply, and the cycle is
+symmetric and positive whatever the geometry. Where only some axes can still be halved, L_c and E_c are P^T . P.
+
+References
+----------
+M. Mohr and R. Wienands, Cell-centred multigrid revisited, Computing and Visualization in Science 7 (2004).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from petsc4py import PETSc
+
+from petfsi.errors import InputError
+from petfsi.petsc import IntType, Layout
+from petfsi.smoothers import Walls
+
+if TYPE_CHECKING:
+    from petfsi.fields.mac.fluid import MacFluid
+
+#: Axes are halved while they have more cells than this.
+COARSEST = 4
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The cells of one level on all ranks: a box of ranks, each with a box of cells; numbers run x first.
+
+    Attributes
+    ----------
+    bounds : list of ndarray
+        Per axis the first cell of each rank along it, and the number of cells.
+    periodic : tuple of bool
+    """
+
+    bounds: list[np.ndarray]
+    periodic: tuple[bool, ...]
+
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """Cells per axis."""
+        return tuple(int(b[-1]) for b in self.bounds)
+
+    def halved(self) -> Lattice:
+        """Return the next level; a rank keeps the coarse cells whose first cell is its own."""
+        return Lattice(
+            [(b + 1) // 2 if b[-1] > COARSEST else b for b in self.bounds],
+            self.periodic,
+        )
+
+    def sizes(self) -> np.ndarray:
+        """Return the number of cells of each rank, ranks along the first axis first."""
+        count = np.ones(1, dtype=np.int64)
+        for b in self.bounds:
+            count = (np.diff(b)[:, None] * count[None, :]).ravel()
+        return count
+
+    def layout(self, rank: int) -> Layout:
+        """Return how a vector of the level lies on the ranks."""
+        ends = np.cumsum(self.sizes())
+        return Layout(int(self.sizes()[rank]), int(ends[rank] - self.sizes()[rank]), int(ends[-1]))
+
+    def owned(self, rank: int) -> list[np.ndarray]:
+        """Return the cells of a rank per axis."""
+        place = np.unravel_index(rank, [len(b) - 1 for b in self.bounds], order="F")
+        return [np.arange(b[p], b[p + 1]) for b, p in zip(self.bounds, place, strict=True)]
+
+    def numbers(self, index: list[np.ndarray]) -> np.ndarray:
+        """Return the unknowns of all cells of the product of the given cells per axis, flat, x first."""
+        starts = np.cumsum(self.sizes()) - self.sizes()
+        rank, local = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        step, ranks = np.ones(1, dtype=np.int64), 1
+        for i, b in zip(index, self.bounds, strict=True):
+            owner = np.searchsorted(b, i, side="right") - 1
+            rank = (owner[:, None] * ranks + rank[None, :]).ravel()
+            local = ((i - b[owner])[:, None] * step[None, :] + local[None, :]).ravel()
+            step = (np.diff(b)[owner][:, None] * step[None, :]).ravel()
+            ranks *= len(b) - 1
+        return starts[rank] + local
+
+
+def line_weights(n: int, periodic: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return for each of n cells in a row its coarse cell, the next nearest one, and that one's weight.
+
+    Beyond a side that is not periodic values go on as they are.
+    """
+    cell = np.arange(n)
+    parent, n_coarse = cell // 2, (n + 1) // 2
+    begin = 2 * np.arange(n_coarse)
+    centre = (begin + np.minimum(begin + 2, n)) / 2
+    away = cell + 0.5 - centre[parent]
+    other = parent + np.sign(away).astype(int)
+    if periodic:
+        distance = np.abs(centre[other % n_coarse] + n * (other // n_coarse) - centre[parent])
+        other %= n_coarse
+    else:
+        other = np.clip(other, 0, n_coarse - 1)
+        distance = np.abs(centre[other] - centre[parent])
+    weight = np.divide(np.abs(away), distance, out=np.zeros(n), where=distance > 0)
+    return parent, other, weight
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """The two interpolations from a level to the next finer one, and whether every axis was halved."""
+
+    linear: PETSc.Mat
+    constant: PETSc.Mat
+    regular: bool
+
+
+def _pairs(fine: Lattice, owned: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return ``line_weights`` of a rank's cells per axis; an axis that stays carries over as it is."""
+    lines = []
+    for b, i, periodic in zip(fine.bounds, owned, fine.periodic, strict=True):
+        n = int(b[-1])
+        lines.append(tuple(w[i] for w in line_weights(n, periodic)) if n > COARSEST else (i, i, np.zeros(len(i))))
+    return lines
+
+
+class Hierarchy:
+    """The interpolations between all levels of a fluid's grid, made once per run and layout of its unknowns.
+
+    Attributes
+    ----------
+    transfers : list of Transfer
+        From the finest level on.
+    """
+
+    def __init__(self, fluid: MacFluid) -> None:
+        grid, self.comm = fluid.grid, fluid.grid.comm
+        bounds = []
+        for axis in range(grid.dim):
+            lows = sorted(set(self.comm.allgather(grid.lo[axis])))
+            bounds.append(np.array([*lows, grid.cells[axis]]))
+        self._lattice = Lattice(bounds, grid.periodic[: grid.dim])
+        self.transfers: list[Transfer] = []
+        self._layout: Layout | None = None
+        self._extra_cells = np.zeros(0, dtype=np.int64)
+        level, fine = self._lattice, self._lattice.layout(self.comm.rank)
+        while max(level.cells) > COARSEST:
+            self.transfers.append(self._transfer(level, level.halved(), fine, np.zeros(0, dtype=np.int64)))
+            level = level.halved()
+            fine = level.layout(self.comm.rank)
+        self.follow(fluid)
+
+    def follow(self, fluid: MacFluid) -> None:
+        """Give extra unknowns behind the grid's the values of their cells' coarse cells. Collective."""
+        grid = fluid.grid
+        cells = np.zeros(0, dtype=np.int64)
+        if fluid.extras is not None:
+            place = np.unravel_index(fluid.extras.cell, grid.shape(None))
+            inner = [p - g for p, g in zip(place, grid.ghost, strict=True)]
+            cells = np.ravel_multi_index(inner[: grid.dim], grid.owned_shape[: grid.dim], order="F")
+        same = self._layout == fluid.layout and np.array_equal(cells, self._extra_cells)
+        if not self.transfers or not self.comm.allreduce(not same) and self._layout is not None:
+            return
+        if self._layout is not None or fluid.extras is not None:
+            self.transfers[0] = self._transfer(self._lattice, self._lattice.halved(), fluid.layout, cells)
+        self._layout, self._extra_cells = fluid.layout, cells
+
+    def _transfer(self, fine: Lattice, coarse: Lattice, rows: Layout, extras: np.ndarray) -> Transfer:
+        lines = _pairs(fine, fine.owned(self.comm.rank))
+        columns = coarse.layout(self.comm.rank)
+        near = coarse.numbers([parent for parent, _, _ in lines])
+        corners, weights = [], []
+        for corner in np.ndindex(*(2,) * len(lines)):
+            index = [line[bit] for line, bit in zip(lines, corner, strict=True)]
+            weight = np.ones(1)
+            for line, bit in zip(lines, corner, strict=True):
+                weight = ((line[2] if bit else 1 - line[2])[:, None] * weight[None, :]).ravel()
+            corners.append(coarse.numbers(index))
+            weights.append(weight)
+        number, weight = np.stack(corners, axis=1), np.stack(weights, axis=1)
+        linear = _aij(self.comm, rows, columns, number, weight, near[extras])
+        constant = _aij(self.comm, rows, columns, near[:, None], np.ones((len(near), 1)), near[extras])
+        return Transfer(linear, constant, regular=min(fine.cells) > COARSEST)
+
+
+def _aij(
+    comm: object, rows: Layout, columns: Layout, number: np.ndarray, weight: np.ndarray, extras: np.ndarray
+) -> PETSc.Mat:
+    """Return a matrix with a few weights per row, equal columns of a row added up; extra rows hold a single one."""
+    order = np.argsort(number, axis=1, kind="stable")
+    number, weight = np.take_along_axis(number, order, 1), np.take_along_axis(weight, order, 1)
+    for k in range(number.shape[1] - 1, 0, -1):
+        twice = number[:, k] == number[:, k - 1]
+        weight[twice, k - 1] += weight[twice, k]
+        weight[twice, k] = 0.0
+    keep = weight > 0
+    counts = np.concatenate((keep.sum(axis=1), np.ones(len(extras), dtype=np.int64)))
+    indptr = np.concatenate(([0], np.cumsum(counts))).astype(IntType)
+    indices = np.concatenate((number[keep], extras)).astype(IntType)
+    values = np.concatenate((weight[keep], np.ones(len(extras))))
+    return PETSc.Mat().createAIJ((rows.sizes, columns.sizes), csr=(indptr, indices, values), comm=comm)
+
+
+class Multigrid:
+    """Hands a PCMG its interpolations and, unless it makes them itself, the operators of its coarse levels.
+
+    Parameters
+    ----------
+    pc : PETSc.PC
+        Of type mg, after ``setFromOptions`` and before ``setUp``.
+    hierarchy : Hierarchy
+    fine : PETSc.Mat
+        The operator of the finest level, L + E; the same object for the life of the PC.
+    """
+
+    def __init__(self, pc: PETSc.PC, hierarchy: Hierarchy, fine: PETSc.Mat) -> None:
+        options = PETSc.Options(pc.getOptionsPrefix())
+        available = len(hierarchy.transfers) + 1
+        levels = options.getInt("pc_mg_levels", available)
+        if not 1 <= levels <= available:
+            name = f"-{pc.getOptionsPrefix()}pc_mg_levels"
+            raise InputError(f"option {name} {levels}: must be from 1 to {available} for this grid")
+        self.transfers = hierarchy.transfers[: levels - 1]
+        self._galerkin = options.getString("pc_mg_galerkin", "none") != "none"
+        self._fluxes: list[PETSc.Mat] = []
+        self._operators: list[PETSc.Mat] = []
+        self._read = False
+        self._pc, self._fine = pc, fine
+        pc.setMGLevels(levels)
+        for n, transfer in enumerate(self.transfers):
+            pc.setMGInterpolation(levels - 1 - n, transfer.linear)
+
+    def refresh(self, fluxes: PETSc.Mat, walls: PETSc.Mat | None) -> None:
+        """Make the coarse operators of L and E, anew or in place. Collective."""
+        if self._galerkin:
+            for level in range(1, len(self.transfers) + 1):  # of the coarse ones nobody knows the parts
+                self._tell(level, (fluxes, walls) if level == len(self.transfers) else (None, None))
+            self._read = True
+            return
+        first = not self._fluxes
+        levels = len(self.transfers) + 1
+        operators, parts = [], [(fluxes, walls)]
+        for n, transfer in enumerate(self.transfers):
+            carry = transfer.constant if transfer.regular else transfer.linear
+            fluxes = _carried(fluxes, carry, None if first else self._fluxes[n])
+            if transfer.regular:
+                fluxes.scale(0.5)
+            if first:
+                self._fluxes.append(fluxes)
+            operator = fluxes
+            if walls is not None:
+                walls = _carried(walls, carry, None)
+                operator = fluxes.copy()
+                operator.axpy(1.0, walls, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            operators.append(operator)
+            parts.append((fluxes, walls))
+        for n, operator in enumerate(operators):
+            level = levels - 2 - n
+            solver = self._pc.getMGSmoother(level) if level else self._pc.getMGCoarseSolve()
+            solver.setOperators(operator, operator)
+        self._pc.getMGSmoother(levels - 1).setOperators(self._fine, self._fine)
+        for n, part in enumerate(parts[: levels - 1]):
+            self._tell(levels - 1 - n, part)
+        self._operators, self._read = operators, True
+
+    def _tell(self, level: int, parts: tuple[PETSc.Mat | None, PETSc.Mat | None]) -> None:
+        """Give the smoother of a level the two parts of its operator, if it cares."""
+        solver = self._pc.getMGSmoother(level)
+        if not self._read:
+            solver.setFromOptions()
+        pc = solver.getPC()
+        if pc.getType() == PETSc.PC.Type.PYTHON:
+            # not by the option pc_python_type: such a context outlives Python and crashes PETSc's end
+            if pc.getPythonContext() is None:
+                pc.setPythonContext(Walls())
+            pc.getPythonContext().parts = parts
+
+
+def _carried(fine: PETSc.Mat, transfer: PETSc.Mat, result: PETSc.Mat | None) -> PETSc.Mat:
+    """Return transfer^T fine transfer, in place of ``result`` if that is given."""
+    return fine.ptap(transfer) if result is None else fine.ptap(transfer, result)

@@ -1,0 +1,150 @@
+"""What the pressure's solver cannot read from options: its grids, its stand-in for S, and what S cannot see."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from petfsi.errors import InputError
+from petfsi.fields.base import FluidField, SolidField
+from petfsi.modes import DEGREE, LIGHT, MOST, Modes
+from petfsi.multigrid import Hierarchy, Multigrid
+from petfsi.schur import SchurStandIn
+from petfsi.system import System
+
+#: A preconditioner is kept while no diagonal entry has changed by more than this part, and the iterations have not
+#: grown by this factor.
+CHANGE, GROWTH = 0.05, 1.2
+#: The inner solver stops at this part of the residual that the whole system may have.
+SHARE = 0.5
+
+
+class PressureSolver:
+    """Serves the KSP of the pressure, be it a split's, a Schur complement's or the only one.
+
+    In order: create it after the outer ``setFromOptions``; ``connect`` the pressure's KSP once it exists; ``refresh``
+    whenever the operator has changed.
+
+    Parameters
+    ----------
+    system : System
+    outer : PETSc.KSP
+        The solver of the whole.
+    fluid : FluidField
+        The field whose unknown the pressure is.
+    """
+
+    def __init__(self, system: System, outer: PETSc.KSP, fluid: FluidField) -> None:
+        self.system, self.fluid = system, fluid
+        self.stand_in: SchurStandIn | None = None
+        self._multigrid: Multigrid | None = None
+        self._ksp: PETSc.KSP | None = None
+        self._has_modes = False
+        self._built: np.ndarray | None = None
+        self._versions: list[int] = []
+        self._first_iterations = 0
+        options = PETSc.Options(outer.getOptionsPrefix())
+        self.eliminates = bool(system.index_sets) and options.getString("pc_fieldsplit_type", "") == "schur"
+        if self.eliminates and options.getString("pc_fieldsplit_schur_precondition", "a11") == "user":
+            own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
+            grids = own.getString("pc_type", "") == PETSc.PC.Type.MG
+            sums = grids and own.getString("pc_mg_galerkin", "none") == "none"
+            self.stand_in = SchurStandIn(system, assembled=own.getBool("schur_assembled", not sums))
+            outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
+
+    def connect(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
+        """Take charge of the pressure's KSP, before it is set up itself. Collective.
+
+        Parameters
+        ----------
+        ksp : PETSc.KSP
+        hierarchy : Hierarchy or None
+            The fluid's grids, if it has any.
+        """
+        self._ksp = ksp
+        if self.eliminates and ksp.getType() == PETSc.KSP.Type.CG and not self._symmetric():
+            ksp.setType(PETSc.KSP.Type.GMRES)
+            ksp.setPCSide(PETSc.PC.Side.RIGHT)
+        pc = ksp.getPC()
+        if pc.getType() == PETSc.PC.Type.MG:
+            if hierarchy is None:
+                raise InputError(f"option -{pc.getOptionsPrefix()}pc_type mg: needs a grid; hypre and gamg do not")
+            fine = self.stand_in.operator if self.stand_in is not None else self.fluid.block
+            self._multigrid = Multigrid(pc, hierarchy, fine)
+        self._pass_on()
+        if self.stand_in is not None and self._symmetric():
+            self._add_modes(ksp)
+
+    def _add_modes(self, ksp: PETSc.KSP) -> None:
+        """Wrap the preconditioner if there are light bodies. Collective."""
+        own = PETSc.Options(ksp.getOptionsPrefix())
+        degree = own.getInt("modes_degree", DEGREE)
+        light = own.getReal("modes_below", LIGHT) * self.fluid.density
+        solid = self.system.fields[0]
+        assert isinstance(solid, SolidField)
+        if degree < 0 or not len(solid.light_motions(degree, light, MOST)):
+            return
+        wrapped = PETSc.PC().create(self.system.comm)
+        wrapped.setType(PETSc.PC.Type.PYTHON)
+        wrapped.setPythonContext(Modes(ksp.getPC(), self.system, degree, light))
+        wrapped.setOperators(*ksp.getOperators())
+        ksp.setPC(wrapped)
+        self._has_modes = True
+
+    def _symmetric(self) -> bool:
+        return all(coupling.symmetric for coupling in self.system.couplings)
+
+    def refresh(self, iterations: int) -> None:
+        """Follow the operator's new values, unless the preconditioner there is good enough. Collective.
+
+        Parameters
+        ----------
+        iterations : int
+            Of the last solve.
+        """
+        stale = self._is_stale(iterations)
+        if stale and self.stand_in is not None:
+            self.stand_in.refresh()
+        self._pass_on(stale)
+
+    def _is_stale(self, iterations: int) -> bool:
+        """Return whether the last preconditioner no longer pays. Collective.
+
+        It is kept while no pattern has changed, no diagonal entry by more than ``lag_change`` of itself, and the
+        iterations have not grown by ``lag_growth`` over those of the first solve with it.
+        """
+        if self.stand_in is None or self._ksp is None or self._has_modes:
+            return True
+        own = PETSc.Options(self._ksp.getOptionsPrefix())
+        change, growth = own.getReal("lag_change", CHANGE), own.getReal("lag_growth", GROWTH)
+        if change <= 0:
+            return True
+        versions = [coupling.pattern_version for coupling in self.system.couplings]
+        self._first_iterations = self._first_iterations or iterations
+        now = np.concatenate([field.block.getDiagonal().array_r for field in self.system.fields])
+        stale = versions != self._versions or iterations > growth * self._first_iterations
+        if self._built is not None:
+            stale = stale or bool(np.any(np.abs(now - self._built) > change * np.abs(self._built)))
+        if self.system.comm.allreduce(stale, MPI.LOR):
+            self._built, self._versions, self._first_iterations = now, versions, 0
+            return True
+        return False
+
+    def _pass_on(self, stale: bool = True) -> None:
+        if stale and self._multigrid is not None:
+            self._multigrid.refresh(self.fluid.block, self.stand_in.walls if self.stand_in is not None else None)
+        if self.eliminates and self._ksp is not None:
+            schur = self._ksp.getOperators()[0]
+            schur.setNullSpace(self.fluid.block.getNullSpace())
+            schur.setTransposeNullSpace(self.fluid.block.getNullSpace())
+
+    def release(self) -> None:
+        """Hold on to no solver any longer."""
+        self._ksp = self._multigrid = None
+
+    def aim(self, residual: float) -> None:
+        """Let the inner solver stop where the whole has the wanted residual, unless options say where."""
+        if self.eliminates and self._ksp is not None:
+            if not PETSc.Options(self._ksp.getOptionsPrefix()).hasName("ksp_atol"):
+                self._ksp.setTolerances(atol=SHARE * residual)

@@ -1,0 +1,85 @@
+"""A smoother for pressures beside walls that give way easily: ``mg_levels_pc_type python``.
+
+Where walls are light, E (see ``schur``) is much larger than L, and singular: pressures that push on no node feel L
+alone. A diagonal then smooths nothing. Here the rows that walls touch are solved together, the others by their
+diagonal:
+
+    M = [ (L + E)_ww      0      ]        w: unknowns with walls.
+        [      0      diag(L)_oo ]
+
+    -..._mg_levels_walls_from 10      largest E_ii / L_ii from which on the block is solved; 0 is always
+    -..._mg_levels_walls_pc_type      how; redundant Cholesky unless told otherwise
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+#: Largest E_ii / L_ii up to which the diagonal is good enough.
+DOMINANT = 10.0
+
+
+class Walls:
+    """Jacobi, with the rows that walls touch solved together where walls dominate.
+
+    Attributes
+    ----------
+    parts : (PETSc.Mat, PETSc.Mat or None)
+        L and E of the operator; set before ``setUp``. Without them this is Jacobi.
+    """
+
+    def __init__(self) -> None:
+        self.parts: tuple[PETSc.Mat | None, PETSc.Mat | None] = None, None
+        self._inverse: PETSc.Vec | None = None
+        self._ksp: PETSc.KSP | None = None
+
+    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
+        """Take up the operator's present values. Collective."""
+        self._prefix = f"{pc.getOptionsPrefix()}walls_"
+        self._dominant = PETSc.Options(self._prefix).getReal("from", DOMINANT)
+        diagonal = pc.getOperators()[1].getDiagonal()
+        self._drop()
+        fluxes, walls = self.parts
+        if fluxes is not None and walls is not None and self._dominates(fluxes, walls):
+            self._solve_together(fluxes, walls)
+        diagonal.reciprocal()
+        self._inverse = diagonal
+
+    def _dominates(self, fluxes: PETSc.Mat, walls: PETSc.Mat) -> bool:
+        here = float((walls.getDiagonal().array / fluxes.getDiagonal().array).max(initial=0.0))
+        return fluxes.comm.tompi4py().allreduce(here, MPI.MAX) > self._dominant
+
+    def _solve_together(self, fluxes: PETSc.Mat, walls: PETSc.Mat) -> None:
+        self._rows = np.flatnonzero(walls.getDiagonal().array)
+        numbers = walls.getOwnershipRange()[0] + self._rows
+        chosen = PETSc.IS().createGeneral(numbers.astype(PETSc.IntType), comm=walls.comm)
+        block = fluxes.createSubMatrix(chosen, chosen)
+        block.axpy(1.0, walls.createSubMatrix(chosen, chosen), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        ksp = PETSc.KSP().create(walls.comm)
+        ksp.setOptionsPrefix(self._prefix)
+        ksp.setOperators(block)
+        ksp.setType(PETSc.KSP.Type.PREONLY)
+        ksp.getPC().setType(PETSc.PC.Type.REDUNDANT)
+        inner = PETSc.Options(f"{self._prefix}redundant_")
+        for name, value in (("pc_type", "cholesky"), ("pc_factor_mat_solver_type", "mumps")):
+            if not inner.hasName(name):
+                inner.setValue(name, value)
+        ksp.setFromOptions()
+        ksp.setUp()
+        self._ksp, (self._x, self._b) = ksp, block.createVecs()
+
+    def _drop(self) -> None:
+        for thing in (self._ksp, self._inverse):
+            if thing is not None:
+                thing.destroy()
+        self._ksp = None
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Write M^-1 x into y. Collective."""
+        y.pointwiseMult(x, self._inverse)
+        if self._ksp is not None:
+            self._b.array[:] = x.array_r[self._rows]
+            self._ksp.solve(self._b, self._x)
+            y.array[self._rows] = self._x.array_r
