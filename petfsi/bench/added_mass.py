@@ -10,7 +10,7 @@ One step of Newmark's scheme from rest in the geometry gives a rigid body exactl
     I = h (m_s - m_f) g         others, let go under gravity,
 
 and so m_a = I/u - m_s whatever h is; m_s and m_f are those of the body's mesh. (A kick alone would do for all, but
-leaves a light body's motion to round-off.) That the body is not quite rigid, h^2 E / (rho R^2) = 6e3, costs 2e-4 of m_a.
+leaves a light body's motion to round-off.) That the body is not quite rigid, h^2 E / (rho R^2) = 6e3, costs 1e-4.
 
 The grid is put at 20 places between the cells; the table gives the root of the mean square of the error, its mean and
 its worst. The transfer ``ray`` is first order and has a bias; it also misses some of the buoyancy.
