@@ -63,9 +63,7 @@ class PressureSolver:
             The fluid's grids, if it has any.
         """
         self._ksp = ksp
-        if self.eliminates and ksp.getType() == PETSc.KSP.Type.CG and not self._symmetric():
-            ksp.setType(PETSc.KSP.Type.GMRES)
-            ksp.setPCSide(PETSc.PC.Side.RIGHT)
+        self._read(PETSc.Options(ksp.getOptionsPrefix()))
         pc = ksp.getPC()
         if pc.getType() == PETSc.PC.Type.MG:
             if hierarchy is None:
@@ -76,11 +74,16 @@ class PressureSolver:
         if self.stand_in is not None and self._symmetric():
             self._add_modes(ksp)
 
+    def _read(self, own: PETSc.Options) -> None:
+        """Read petfsi's own options, whether this scene needs them or not, so that none goes unread."""
+        self._change, self._growth = own.getReal("lag_change", CHANGE), own.getReal("lag_growth", GROWTH)
+        self._degree, self._light = own.getInt("modes_degree", DEGREE), own.getReal("modes_below", LIGHT)
+        self._aims = not own.hasName("ksp_atol")
+        own.getBool("schur_assembled", False)
+
     def _add_modes(self, ksp: PETSc.KSP) -> None:
         """Wrap the preconditioner if there are light bodies. Collective."""
-        own = PETSc.Options(ksp.getOptionsPrefix())
-        degree = own.getInt("modes_degree", DEGREE)
-        light = own.getReal("modes_below", LIGHT) * self.fluid.density
+        degree, light = self._degree, self._light * self.fluid.density
         solid = self.system.fields[0]
         assert isinstance(solid, SolidField)
         if degree < 0 or not len(solid.light_motions(degree, light, MOST)):
@@ -91,6 +94,15 @@ class PressureSolver:
         wrapped.setOperators(*ksp.getOperators())
         ksp.setPC(wrapped)
         self._has_modes = True
+
+    def settle(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
+        """Look after the pressure's KSP once the outer one is set up, which may have made it anew. Collective."""
+        if self._ksp is None or self._ksp.handle != ksp.handle:
+            self._multigrid, self._has_modes, self._built = None, False, None
+            self.connect(ksp, hierarchy)
+        if self.eliminates and ksp.getType() == PETSc.KSP.Type.CG and not self._symmetric():
+            ksp.setType(PETSc.KSP.Type.GMRES)
+            ksp.setPCSide(PETSc.PC.Side.RIGHT)
 
     def _symmetric(self) -> bool:
         return all(coupling.symmetric for coupling in self.system.couplings)
@@ -116,16 +128,14 @@ class PressureSolver:
         """
         if self.stand_in is None or self._ksp is None or self._has_modes:
             return True
-        own = PETSc.Options(self._ksp.getOptionsPrefix())
-        change, growth = own.getReal("lag_change", CHANGE), own.getReal("lag_growth", GROWTH)
-        if change <= 0:
+        if self._change <= 0:
             return True
         versions = [coupling.pattern_version for coupling in self.system.couplings]
         self._first_iterations = self._first_iterations or iterations
         now = np.concatenate([field.block.getDiagonal().array_r for field in self.system.fields])
-        stale = versions != self._versions or iterations > growth * self._first_iterations
+        stale = versions != self._versions or iterations > self._growth * self._first_iterations
         if self._built is not None:
-            stale = stale or bool(np.any(np.abs(now - self._built) > change * np.abs(self._built)))
+            stale = stale or bool(np.any(np.abs(now - self._built) > self._change * np.abs(self._built)))
         if self.system.comm.allreduce(stale, MPI.LOR):
             self._built, self._versions, self._first_iterations = now, versions, 0
             return True
@@ -145,6 +155,5 @@ class PressureSolver:
 
     def aim(self, residual: float) -> None:
         """Let the inner solver stop where the whole has the wanted residual, unless options say where."""
-        if self.eliminates and self._ksp is not None:
-            if not PETSc.Options(self._ksp.getOptionsPrefix()).hasName("ksp_atol"):
-                self._ksp.setTolerances(atol=SHARE * residual)
+        if self.eliminates and self._aims and self._ksp is not None:
+            self._ksp.setTolerances(atol=SHARE * residual)

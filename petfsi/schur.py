@@ -1,6 +1,6 @@
 """A sparse stand-in for the pressure's Schur complement S = L + D1 H A^-1 J.
 
-With X the inverse of A's diagonal, Sp = L + E and E = D1 H X J differ from L only in rows of cells that moving
+With X the inverse of A's diagonal, Sp = L + E and E = J^T X J differ from L only in rows of cells that moving
 walls touch. X keeps what matters near the walls: a mass alone would be wrong for stiff solids, nothing at all for
 light ones. What it lacks are the large motions of light bodies; see ``deflation``.
 """
@@ -38,7 +38,6 @@ class SchurStandIn:
         solid, fluid = system.fields
         layout: Layout = fluid.layout
         self.solid_block, self.fluxes = solid.block, fluid.block
-        self.flux_block = system.operator.getNestSubMatrix(1, 0)
         self.force_block = system.operator.getNestSubMatrix(0, 1)
         self._comm = system.comm
         self._pattern: tuple[np.ndarray, np.ndarray] | None = None
@@ -66,8 +65,8 @@ class SchurStandIn:
         inverse.reciprocal()
         yielding = self.force_block.copy()
         yielding.diagonalScale(L=inverse)
-        walls = self.flux_block.matMult(yielding)
-        walls.scale(-1.0)
+        # J^T X J, positive also where the transfer is not symmetric and D1 H is not J^T
+        walls = self.force_block.transposeMatMult(yielding)
         rows = walls.getValuesCSR()
         self._walls_pattern = self._set(self.walls, rows, self._walls_pattern)
         for thing in (inverse, yielding, walls):
@@ -79,6 +78,7 @@ class SchurStandIn:
             self._pattern = self._set(self.operator, rows, self._pattern)
         else:
             self.operator.assemble()
+            self.operator.stateIncrease()  # a sum does not notice that its terms have changed
 
     def _set(
         self,

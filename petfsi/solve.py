@@ -152,6 +152,9 @@ class Solver:
             elif self._pressure is not None:
                 self._pressure.refresh(self._inner_iterations)
             self._ksp.setUp()
+            if self._pressure is not None and self._sub_solvers(self._ksp):
+                fluid = self._pressure.fluid
+                self._pressure.settle(self._sub_solvers(self._ksp)[-1], self._grids(fluid))
         except PETSc.Error as error:
             raise InputError(_option_story(self.prefix, error)) from None
 
@@ -169,8 +172,6 @@ class Solver:
             if not system.index_sets:
                 self._pressure.connect(ksp, self._grids(fluid))
         ksp.setUp()
-        if self._pressure is not None and self._sub_solvers(ksp):
-            self._pressure.connect(self._sub_solvers(ksp)[-1], self._grids(fluid))
         for sub in self._sub_solvers(ksp):
             if sub.getType() != PETSc.KSP.Type.PREONLY:
                 sub.setMonitor(self._count)

@@ -70,23 +70,22 @@ def test_the_midpoint_rule_keeps_the_energy_and_bdf2_does_not():
 # ---- the coupled system's order in time ---------------------------------------------------------------------
 
 
-def top(integrator, per_period, periods=2):
-    """Return the motion of the layer's top under the ray transfer."""
-    column = Column(1.0, 16, 1, "ray", integrator)
+def top(transfer, integrator, per_period, periods=2):
+    """Return the motion of the layer's top."""
+    column = Column(1.0, 16, 1, transfer, integrator)
     scene = column.scene(COMM, column.period / per_period)
-    return np.array(history(COMM, scene, MONOLITHIC, periods * per_period))
+    return history(COMM, scene, MONOLITHIC, periods * per_period)
 
 
-@pytest.fixture(scope="module")
-def tiny_steps():
-    """The motion at 640 steps a period."""
-    return top("midpoint", 640)
+@pytest.fixture(scope="module", params=["ray", "cutcell"])
+def tiny_steps(request):
+    """The transfer, and the motion at 640 steps a period."""
+    return request.param, top(request.param, "midpoint", 640)
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_layer_and_water_together_keep_order_two(integrator, tiny_steps):
-    errors = []
-    for n in (40, 80):
-        errors.append(np.abs(top(integrator, n) - tiny_steps[:: 640 // n]).max())
+    transfer, reference = tiny_steps
+    errors = [np.abs(top(transfer, integrator, n) - reference[:: 640 // n]).max() for n in (40, 80)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1), errors
-    assert errors[1] < 0.03 * np.abs(tiny_steps).max()
+    assert errors[1] < 0.03 * np.abs(reference).max()

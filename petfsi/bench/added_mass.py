@@ -6,14 +6,14 @@ A body of radius R at the centre of a container of radius B, both full of or sur
 
 One step of Newmark's scheme from rest in the geometry gives a rigid body exactly  (m_s + m_a) u = I  with the impulse
 
-    I = m_s u_0                 a body as heavy as the fluid, set off at u_0 in fluid at rest,
-    I = h (m_s - m_f) g         others, let go under gravity,
+    I = m_s u_0                 a body as heavy as the fluid or heavier, set off at u_0 in fluid at rest,
+    I = h (m_s - m_f) g         a lighter one, let go under gravity,
 
 and so m_a = I/u - m_s whatever h is; m_s and m_f are those of the body's mesh. (A kick alone would do for all, but
 leaves a light body's motion to round-off.) That the body is not quite rigid, h^2 E / (rho R^2) = 6e3, costs 1e-4.
 
 The grid is put at 20 places between the cells; the table gives the root of the mean square of the error, its mean and
-its worst. The transfer ``ray`` is first order and has a bias; it also misses some of the buoyancy.
+its worst. The transfer ``ray`` is first order and has a bias; under gravity it also misses some of the buoyancy.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Body:
         """Return the scene on a grid that lies ``offset`` cells off. Collective."""
         name, dim = self.name, self.dim
         kicked, rest = np.zeros(dim), np.zeros(dim)
-        (kicked if self.ratio == 1 else rest)[1] = -SPEED
+        (kicked if self.ratio >= 1 else rest)[1] = -SPEED
         origin = -0.5 * SIZE + offset * SIZE / self.cells
         sets = {
             "gravity": list(rest / DT),
@@ -111,7 +111,7 @@ class Body:
             sim.advance()
             u = sim.probe()[sim.probe_columns().index("centre.y")]
         heavy = self.ratio * DENSITY * volume
-        driven = heavy if self.ratio == 1 else heavy - DENSITY * volume
+        driven = heavy if self.ratio >= 1 else heavy - DENSITY * volume
         return (-driven * SPEED / u - heavy) / theoretical(self.dim) - 1
 
 

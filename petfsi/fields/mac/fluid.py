@@ -307,7 +307,7 @@ class MacFluid(FluidField):
                 self.boundary_velocity[axis],
                 kind,
                 kinds.STEP[axis],
-                dv if self.weight is None else 0.0,
+                dv if self.weight is None or self.grid.periodic[axis] else 0.0,
                 self.pressure if smoke is None else smoke,
                 -buoyancy * dv,
                 self._part(axis),

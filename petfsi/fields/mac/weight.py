@@ -40,8 +40,9 @@ class Weight:
         self.gradient = np.zeros(grid.dim)
 
     def at(self, time: float) -> None:
-        """Take gravity at a time."""
-        self.gradient = self.density * np.array([float(g(t=time)) for g in self._gravity])
+        """Take gravity at a time; nothing bears it along a periodic axis, where it stays a force on the fluid."""
+        borne = ~np.array(self.grid.periodic[: self.grid.dim])
+        self.gradient = self.density * np.array([float(g(t=time)) for g in self._gravity]) * borne
 
     def pressure(self) -> np.ndarray:
         """Return rho g . (x - x_0) in all local cells, Pa."""
