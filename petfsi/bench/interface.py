@@ -106,7 +106,6 @@ def _attempt(trial: Trial, scheme: Scheme, cells: int, rate: int) -> Row:
     try:
         dt, error, seconds = trial.measure(scheme, cells, rate)
     except SolveError as failed:
-        # the word of PETSc, if it was the solver that gave up
         why = next((word for word in str(failed).split() if word.startswith("DIVERGED")), "blew up")
         return {"dt": "", "error": "", "seconds": "", "why": why}
     if not error < LOST:
