@@ -163,7 +163,7 @@ def _judge_disk(report: Report, rows: list[Row]) -> None:
 
 
 def _picture(report: Report) -> Figure:
-    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    figure = Figure(figsize=(10.5, 3.8), layout="constrained")
     for axes, body in zip(figure.subplots(1, 2, sharey=True), ("disk", "ball"), strict=True):
         rows = [row for row in report.rows if row["body"] == body]
         for colour, transfer in enumerate(TRANSFERS):
@@ -179,5 +179,5 @@ def _picture(report: Report) -> Figure:
         axes.set_xticks(cells, [f"{n}" for n in cells])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set(xlabel="cells along an axis", ylabel="rms error of the added mass", title=body)
-    axes.legend(fontsize=8)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     return figure

@@ -298,7 +298,7 @@ def _keep_energy(case: Case, report: Report, column: Column) -> None:
 
 def _picture(report: Report) -> Figure:
     """Draw every scheme in its colour and every ratio with its marker; lines are theory, but for the mesh's."""
-    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    figure = Figure(figsize=(12, 4.6), layout="constrained")
     mesh, step, damping = figure.subplots(1, 3)
     colours = {f"{transfer} {integrator}": f"C{n}" for n, (transfer, integrator) in enumerate(SCHEMES)}
     for scheme, colour in colours.items():
@@ -327,6 +327,6 @@ def _picture(report: Report) -> Figure:
     mesh.set(xlabel="cells along y", ylabel="relative error of the mode", title="mesh (dotted: planes off the top)")
     step.set(xlabel="dt / period", ylabel="relative error of the frequency", title="step (lines: theory)")
     damping.set(xlabel="dt / period", ylabel="damping rate x period", title="numerical damping (lines: theory)")
-    mesh.legend()
     step.legend()
+    figure.legend(*mesh.get_legend_handles_labels(), loc="outside lower center", ncols=len(SCHEMES))
     return figure

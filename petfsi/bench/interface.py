@@ -291,16 +291,23 @@ def _compare(report: Report, scene: str) -> None:
 
 
 def _picture(report: Report) -> Figure:
-    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    """Draw a panel for each scene; what failed everywhere is named in it."""
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
     scenes = list(dict.fromkeys(row["scene"] for row in report.rows))
-    for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+    panels = figure.subplots(1, len(scenes), squeeze=False)[0]
+    for axes, scene in zip(panels, scenes, strict=True):
+        lost = []
         for n, scheme in enumerate(SCHEMES):
             rows = [row for row in report.rows if (row["scene"], row["scheme"]) == (scene, scheme.name)]
             done = [row for row in rows if not row["why"]]
-            label = scheme.name if done else f"{scheme.name}: {rows[0]['why']}"
             line = ("o-", "s-", "v-", "D--", "^--", "<:", ">-.")[n]
-            axes.loglog([r["seconds"] for r in done], [r["error"] for r in done], line, color=f"C{n}", label=label)
+            x, y = [r["seconds"] for r in done], [r["error"] for r in done]
+            axes.loglog(x, y, line, color=f"C{n}", mfc="none", label=scheme.name)
+            lost += [f"{scheme.name}: {rows[0]['why']}"] if rows and not done else []
         axes.axhline(WANTED, color="k", lw=0.6)
+        box = {"fc": "w", "ec": "none", "alpha": 0.8}
+        axes.text(0.02, 0.02, "\n".join(lost), transform=axes.transAxes, fontsize=7, va="bottom", bbox=box)
         axes.set(xlabel="seconds of the steps", ylabel="relative error", title=scene)
-        axes.legend(fontsize=7)
+        axes.grid(alpha=0.3, which="both", lw=0.4)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     return figure
