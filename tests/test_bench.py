@@ -21,19 +21,40 @@ def test_the_first_wave_number_solves_its_equation_and_knows_its_limits():
     assert theory.first_wave_number(1e9) == pytest.approx(np.pi / 2, rel=1e-6)  # a free end
 
 
-def test_newmarks_root_is_that_of_an_oscillator_stepped_by_hand():
-    omega, h = 3.0, 0.2
+def one_step(scheme, omega, h):
+    """Return the matrix of a step of  d'' = -omega^2 d  on (d, u), for bdf2 on (d, u) of two levels."""
     q = (omega * h) ** 2
-    step = np.array([[1 - q / 2, -(omega**2) * h], [0.0, 0.0]]) / (1 + q / 2)
-    step[1] = [h / 2 * (1 + step[0, 0]), 1 + h / 2 * step[0, 1]]
-    assert theory.newmark_root(omega, h) == pytest.approx(max(np.linalg.eigvals(step), key=np.imag), rel=1e-12)
-    assert theory.undo_newmark(theory.newmark_observed(omega, h)[0], h) == pytest.approx(omega, rel=1e-12)
+    A = np.array([[0.0, 1.0], [-(omega**2), 0.0]])
+    one = np.eye(2)
+    if scheme == "midpoint":
+        return np.linalg.solve(one - h / 2 * A, one + h / 2 * A)
+    if scheme == "bdf2":
+        new = np.linalg.solve(3 * one - 2 * h * A, np.hstack((4 * one, -one)))
+        return np.vstack((new, np.hstack((one, 0 * one))))
+    u = np.array([-(omega**2) * h, 1 - q / 2]) / (1 + q / 2)
+    return np.array([[1 + h / 2 * u[0], h / 2 * (1 + u[1])], u])
 
 
-def test_newmark_damps_by_a_quarter_and_lags_as_stated():
-    frequency, damping = theory.newmark_observed(1.0, 0.01)
-    assert damping == pytest.approx(0.01 / 4, rel=1e-4)
-    assert 1 - frequency == pytest.approx(0.115e-4, rel=0.01)
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "midpoint"])
+def test_the_root_is_that_of_an_oscillator_stepped_by_hand(scheme):
+    omega, h = 3.0, 0.2
+    stepped = np.linalg.eigvals(one_step(scheme, omega, h))
+    assert np.abs(stepped - theory.root(scheme, omega, h)).min() < 1e-12
+    assert theory.undo(scheme, theory.observed(scheme, omega, h)[0], h) == pytest.approx(omega, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "scheme, lag, damping", [("newmark", 0.1146, 0.01 / 4), ("bdf2", 1 / 3, 1e-6 / 4), ("midpoint", 1 / 12, 0.0)]
+)
+def test_what_a_step_does_to_a_mode_is_as_stated(scheme, lag, damping):
+    seen = theory.observed(scheme, 1.0, 0.01)
+    assert seen[1] == pytest.approx(damping, rel=1e-3, abs=1e-12)
+    assert 1 - seen[0] == pytest.approx(lag * 1e-4, rel=1e-3)
+
+
+def test_a_scheme_without_theory_is_told():
+    with pytest.raises(ValueError, match="no theory of the scheme 'euler'"):
+        theory.root("euler", 1.0, 0.1)
 
 
 def test_a_damped_sinusoid_is_read_back():

@@ -18,25 +18,41 @@ def first_wave_number(mass_ratio: float) -> float:
     return float(brentq(lambda x: x * np.sin(x) - mass_ratio * np.cos(x), 0.0, np.pi / 2, xtol=1e-14))
 
 
-def newmark_root(omega: float, dt: float) -> complex:
-    """Return the factor by which a step multiplies a free mode, z of (1 + q/2) z^2 - (2 - q/2) z + 1 = 0.
+def root(scheme: str, omega: float, dt: float) -> complex:
+    """Return the factor z by which a step of a scheme multiplies a free, undamped mode of frequency ``omega``.
 
-    With q = (omega dt)^2. The root in the upper half plane: ln z / dt = -damping + i frequency, so the damping is
-    omega^2 dt / 4 and the frequency falls short by 0.115 q, to leading order.
+    The one in the upper half plane that tends to exp(i omega dt): with q = (omega dt)^2 and ln z = (i f - g) dt the
+    mode is seen to swing at f and to decay at the rate g. To leading order:
+
+    =========  =======================================  ================  =====================
+    newmark    (1 + q/2) z^2 - (2 - q/2) z + 1 = 0      f/omega - 1       -0.115 q
+                                                        g                 omega^2 dt / 4
+    bdf2       3 - 4/z + 1/z^2 = 2 i omega dt           f/omega - 1       -q / 3
+                                                        g                 omega^4 dt^3 / 4
+    midpoint   2 (z - 1)/(z + 1) = i omega dt           f/omega - 1       -q / 12
+                                                        g                 0
+    =========  =======================================  ================  =====================
     """
-    q = (omega * dt) ** 2
-    return complex(max(np.roots([1 + q / 2, -(2 - q / 2), 1]), key=np.imag))
+    x = 1j * omega * dt
+    if scheme == "newmark":
+        q = (omega * dt) ** 2
+        return complex(max(np.roots([1 + q / 2, -(2 - q / 2), 1]), key=np.imag))
+    if scheme == "bdf2":
+        return complex(1 / (2 - np.sqrt(1 + 2 * x)))
+    if scheme == "midpoint":
+        return complex((2 + x) / (2 - x))
+    raise ValueError(f"no theory of the scheme {scheme!r}; there is of newmark, bdf2 and midpoint")
 
 
-def newmark_observed(omega: float, dt: float) -> tuple[float, float]:
+def observed(scheme: str, omega: float, dt: float) -> tuple[float, float]:
     """Return the angular frequency and the damping rate, 1/s, that a mode of frequency ``omega`` shows."""
-    exponent = np.log(newmark_root(omega, dt)) / dt
+    exponent = np.log(root(scheme, omega, dt)) / dt
     return float(exponent.imag), float(-exponent.real)
 
 
-def undo_newmark(observed: float, dt: float) -> float:
-    """Return the angular frequency of the mode that shows the frequency ``observed`` at steps of ``dt``."""
-    return float(brentq(lambda w: newmark_observed(w, dt)[0] - observed, 0.5 * observed, 2.0 * observed, xtol=1e-13))
+def undo(scheme: str, seen: float, dt: float) -> float:
+    """Return the angular frequency of the mode that shows the frequency ``seen`` at steps of ``dt``."""
+    return float(brentq(lambda w: observed(scheme, w, dt)[0] - seen, 0.5 * seen, 2.0 * seen, xtol=1e-13))
 
 
 def fit_damped_sinusoid(t: np.ndarray, y: np.ndarray, omega: float, damping: float) -> tuple[float, float]:
@@ -46,7 +62,9 @@ def fit_damped_sinusoid(t: np.ndarray, y: np.ndarray, omega: float, damping: flo
     def model(t: np.ndarray, omega: float, damping: float, a: float, b: float) -> np.ndarray:
         return np.exp(-damping * t) * (a * np.cos(omega * t) + b * np.sin(omega * t))
 
-    (omega, damping, _, _), _ = curve_fit(model, t, y / scale, p0=(omega, damping, 0.0, 1.0))
+    # the search takes its first step in proportion to the guess, and none at all from a damping of zero
+    guess = omega, max(damping, 1e-3 * omega), 0.0, 1.0
+    (omega, damping, _, _), _ = curve_fit(model, t, y / scale, p0=guess)
     return float(omega), float(damping)
 
 
