@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from petfsi.errors import InputError
 from petfsi import petsc
+from petfsi.errors import InputError
 from petfsi.petsc import IntType, Layout
 from petfsi.smoothers import Walls
 

@@ -130,7 +130,8 @@ class PressureSolver:
             return True
         if self._change <= 0:
             return True
-        versions = [part.pattern_version for part in (*self.system.fields, *self.system.couplings)]
+        versions = [field.pattern_version for field in self.system.fields]
+        versions += [coupling.pattern_version for coupling in self.system.couplings]
         self._first_iterations = self._first_iterations or iterations
         now = np.concatenate([field.block.getDiagonal().array_r for field in self.system.fields])
         stale = versions != self._versions or iterations > self._growth * self._first_iterations
