@@ -249,6 +249,7 @@ class Multigrid:
             return
         first = not self._fluxes
         levels = len(self.transfers) + 1
+        finest = fluxes if walls is None else self._fine
         operators, parts = [], [(fluxes, walls)]
         for n, transfer in enumerate(self.transfers):
             carry = transfer.constant if transfer.regular else transfer.linear
@@ -264,13 +265,12 @@ class Multigrid:
                 operator.axpy(1.0, walls, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             operators.append(operator)
             parts.append((fluxes, walls))
-        for n, operator in enumerate(operators):
-            level = levels - 2 - n
+        for n, operator in enumerate([finest, *operators]):
+            level = levels - 1 - n
             solver = self._pc.getMGSmoother(level) if level else self._pc.getMGCoarseSolve()
             solver.setOperators(operator, operator)
             if level:
                 petsc.set_mg_residual(self._pc, level, operator)
-        self._pc.getMGSmoother(levels - 1).setOperators(self._fine, self._fine)
         for n, part in enumerate(parts[: levels - 1]):
             self._tell(levels - 1 - n, part)
         self._operators, self._read = operators, True

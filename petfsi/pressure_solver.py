@@ -10,7 +10,7 @@ from petfsi.errors import InputError
 from petfsi.fields.base import FluidField, SolidField
 from petfsi.modes import DEGREE, LIGHT, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
-from petfsi.schur import SchurStandIn
+from petfsi.schur import FAINT, SchurStandIn
 from petfsi.system import System
 
 #: A preconditioner is kept while no diagonal entry has changed by more than this part, and the iterations have not
@@ -50,7 +50,8 @@ class PressureSolver:
             own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
             grids = own.getString("pc_type", "") == PETSc.PC.Type.MG
             sums = grids and own.getString("pc_mg_galerkin", "none") == "none"
-            self.stand_in = SchurStandIn(system, assembled=own.getBool("schur_assembled", not sums))
+            assembled, faint = own.getBool("schur_assembled", not sums), own.getReal("schur_faint", FAINT)
+            self.stand_in = SchurStandIn(system, assembled, faint)
             outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
 
     def connect(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
@@ -80,6 +81,7 @@ class PressureSolver:
         self._degree, self._light = own.getInt("modes_degree", DEGREE), own.getReal("modes_below", LIGHT)
         self._aims = not own.hasName("ksp_atol")
         own.getBool("schur_assembled", False)
+        own.getReal("schur_faint", FAINT)
 
     def _add_modes(self, ksp: PETSc.KSP) -> None:
         """Wrap the preconditioner if there are light bodies. Collective."""
@@ -144,7 +146,7 @@ class PressureSolver:
 
     def _pass_on(self, stale: bool = True) -> None:
         if stale and self._multigrid is not None:
-            walls = self.stand_in.walls if self.stand_in is not None else None
+            walls = self.stand_in.walls if self.stand_in is not None and self.stand_in.matter else None
             self._multigrid.refresh(self.fluid.block, walls, self.fluid.pattern_version)
         if self.eliminates and self._ksp is not None:
             schur = self._ksp.getOperators()[0]

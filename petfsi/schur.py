@@ -2,18 +2,24 @@
 
 With X the inverse of A's diagonal, Sp = L + E and E = J^T X J differ from L only in rows of cells that moving
 walls touch. X keeps what matters near the walls: a mass alone would be wrong for stiff solids, nothing at all for
-light ones. What it lacks are the large motions of light bodies; see ``deflation``.
+light ones. Where E is small beside L, as for most solids, it is left out and costs nothing. What X lacks are the
+large motions of light bodies; see ``modes``.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 from numba import njit
 from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.petsc import IntType, Layout, new_block, set_csr
 from petfsi.system import System
+
+
+#: Largest E_ii / L_ii up to which E is left out.
+FAINT = 0.01
 
 
 class SchurStandIn:
@@ -25,16 +31,20 @@ class SchurStandIn:
     assembled : bool
         Whether Sp is one AIJ matrix, as most preconditioners want it, or the unassembled sum of L and E, which costs
         nothing to make.
+    faint : float
+        Largest E_ii / L_ii up to which E is left out.
 
     Attributes
     ----------
     operator : PETSc.Mat
         Sp; the same object for the whole life.
     walls : PETSc.Mat
-        E; the same object, too.
+        E; the same object, too. Empty where it is left out.
+    matter : bool
+        Whether E is there.
     """
 
-    def __init__(self, system: System, assembled: bool) -> None:
+    def __init__(self, system: System, assembled: bool, faint: float) -> None:
         solid, fluid = system.fields
         layout: Layout = fluid.layout
         self.solid_block, self.fluxes = solid.block, fluid.block
@@ -43,7 +53,8 @@ class SchurStandIn:
         self._pattern: tuple[np.ndarray, np.ndarray] | None = None
         self._walls_pattern: tuple[np.ndarray, np.ndarray] | None = None
         self.walls = new_block(system.comm, layout, layout)
-        self._assembled = assembled
+        self._assembled, self._faint = assembled, faint
+        self.matter = True
         if assembled:
             self.operator = new_block(system.comm, layout, layout)
         self._fill_walls()
@@ -63,14 +74,31 @@ class SchurStandIn:
     def _fill_walls(self) -> None:
         inverse = self.solid_block.getDiagonal()
         inverse.reciprocal()
-        yielding = self.force_block.copy()
-        yielding.diagonalScale(L=inverse)
-        # J^T X J, positive also where the transfer is not symmetric and D1 H is not J^T
-        walls = self.force_block.transposeMatMult(yielding)
-        rows = walls.getValuesCSR()
+        self.matter = self._strength(inverse) > self._faint
+        if self.matter:
+            yielding = self.force_block.copy()
+            yielding.diagonalScale(L=inverse)
+            # J^T X J, positive also where the transfer is not symmetric and D1 H is not J^T
+            walls = self.force_block.transposeMatMult(yielding)
+            rows = walls.getValuesCSR()
+            yielding.destroy()
+            walls.destroy()
+        else:
+            rows = np.zeros(self.walls.getLocalSize()[0] + 1, dtype=IntType), np.zeros(0, dtype=IntType), np.zeros(0)
         self._walls_pattern = self._set(self.walls, rows, self._walls_pattern)
-        for thing in (inverse, yielding, walls):
+        inverse.destroy()
+
+    def _strength(self, inverse: PETSc.Vec) -> float:
+        """Return the largest E_ii / L_ii. Collective."""
+        squares = self.force_block.copy()
+        indptr, indices, values = squares.getValuesCSR()
+        set_csr(squares, indptr, indices, values**2, new_pattern=False)
+        diagonal, resistance = squares.createVecRight(), self.fluxes.getDiagonal()
+        squares.multTranspose(inverse, diagonal)
+        strongest = float((diagonal.array_r / resistance.array_r).max(initial=0.0))
+        for thing in (squares, diagonal, resistance):
             thing.destroy()
+        return self._comm.allreduce(strongest, MPI.MAX)
 
     def _fill_operator(self) -> None:
         if self._assembled:

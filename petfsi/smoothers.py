@@ -1,11 +1,17 @@
-"""A smoother for pressures beside walls that give way easily: ``mg_levels_pc_type python``.
+"""A smoother for pressures, also beside walls that give way easily: ``mg_levels_pc_type python``.
 
-Where walls are light, E (see ``schur``) is much larger than L, and singular: pressures that push on no node feel L
-alone. A diagonal then smooths nothing. Here the rows that walls touch are solved together, the others by their
-diagonal:
+Jacobi, with a diagonal that bounds the operator,
+
+    D_i = max(a_ii, sum_j |a_ij| / 2)    of the fluxes L, plus the same of the walls E (see ``schur``),
+
+so that no eigenvalue of D^-1 (L + E) exceeds 2, whatever the geometry, and Chebyshev's bounds need no estimate.
+Where walls are light, E is much larger than L, and singular: pressures that push on no node feel L alone. A diagonal
+then smooths nothing. There the rows that walls touch are solved together, the others by their diagonal:
 
     M = [ (L + E)_ww      0      ]        w: unknowns with walls.
         [      0      diag(L)_oo ]
+
+No eigenvalue of M^-1 (L + E) exceeds 2 either.
 
     -..._mg_levels_walls_from 10      largest E_ii / L_ii from which on the block is solved; 0 is always
     -..._mg_levels_walls_pc_type      how; redundant Cholesky unless told otherwise
@@ -26,8 +32,8 @@ class Walls:
 
     Attributes
     ----------
-    parts : (PETSc.Mat, PETSc.Mat or None)
-        L and E of the operator; set before ``setUp``. Without them this is Jacobi.
+    parts : (PETSc.Mat or None, PETSc.Mat or None)
+        L and E of the operator; set before ``setUp``. Without them the operator is L.
     """
 
     def __init__(self) -> None:
@@ -39,11 +45,14 @@ class Walls:
         """Take up the operator's present values. Collective."""
         self._prefix = f"{pc.getOptionsPrefix()}walls_"
         self._dominant = PETSc.Options(self._prefix).getReal("from", DOMINANT)
-        diagonal = pc.getOperators()[1].getDiagonal()
         self._drop()
         fluxes, walls = self.parts
-        if fluxes is not None and walls is not None and self._dominates(fluxes, walls):
-            self._solve_together(fluxes, walls)
+        diagonal = _bound(fluxes if fluxes is not None else pc.getOperators()[1])
+        if walls is not None:
+            if fluxes is not None and self._dominates(fluxes, walls):
+                self._solve_together(fluxes, walls)
+            else:
+                diagonal.axpy(1.0, _bound(walls))
         diagonal.reciprocal()
         self._inverse = diagonal
 
@@ -83,3 +92,15 @@ class Walls:
             self._b.array[:] = x.array_r[self._rows]
             self._ksp.solve(self._b, self._x)
             y.array[self._rows] = self._x.array_r
+
+
+def _bound(mat: PETSc.Mat) -> PETSc.Vec:
+    """Return max(a_ii, sum_j |a_ij| / 2) by row. Collective."""
+    diagonal = mat.getDiagonal()
+    indptr, _, values = mat.getValuesCSR()
+    sums = np.zeros(len(indptr) - 1)
+    full = np.diff(indptr) > 0
+    if len(values):
+        sums[full] = np.add.reduceat(np.abs(values), indptr[:-1][full])
+    diagonal.array = np.maximum(diagonal.array_r, 0.5 * sums)
+    return diagonal
