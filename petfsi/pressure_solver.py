@@ -50,7 +50,7 @@ class PressureSolver:
             own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
             grids = own.getString("pc_type", "") == PETSc.PC.Type.MG
             sums = grids and own.getString("pc_mg_galerkin", "none") == "none"
-            assembled, faint = own.getBool("schur_assembled", not sums), own.getReal("schur_faint", FAINT)
+            assembled, faint = own.getBool("schur_assembled", True), own.getReal("schur_faint", FAINT)
             self.stand_in = SchurStandIn(system, assembled, faint)
             outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
 
