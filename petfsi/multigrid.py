@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
+from petfsi import petsc
 from petfsi.errors import InputError
 from petfsi.petsc import IntType, Layout
 from petfsi.smoothers import Walls
@@ -229,6 +230,7 @@ class Multigrid:
         self.transfers = hierarchy.transfers[: levels - 1]
         self._galerkin = options.getString("pc_mg_galerkin", "none") != "none"
         self._fluxes: list[PETSc.Mat] = []
+        self._pattern_version = 0
         self._operators: list[PETSc.Mat] = []
         self._read = False
         self._pc, self._fine = pc, fine
@@ -236,8 +238,10 @@ class Multigrid:
         for n, transfer in enumerate(self.transfers):
             pc.setMGInterpolation(levels - 1 - n, transfer.linear)
 
-    def refresh(self, fluxes: PETSc.Mat, walls: PETSc.Mat | None) -> None:
-        """Make the coarse operators of L and E, anew or in place. Collective."""
+    def refresh(self, fluxes: PETSc.Mat, walls: PETSc.Mat | None, pattern_version: int) -> None:
+        """Make the coarse operators of L and E, in place if the pattern of L is that of the last call. Collective."""
+        if pattern_version != self._pattern_version:
+            self._fluxes, self._pattern_version = [], pattern_version
         if self._galerkin:
             for level in range(1, len(self.transfers) + 1):  # of the coarse ones nobody knows the parts
                 self._tell(level, (fluxes, walls) if level == len(self.transfers) else (None, None))
@@ -264,6 +268,8 @@ class Multigrid:
             level = levels - 2 - n
             solver = self._pc.getMGSmoother(level) if level else self._pc.getMGCoarseSolve()
             solver.setOperators(operator, operator)
+            if level:
+                petsc.set_mg_residual(self._pc, level, operator)
         self._pc.getMGSmoother(levels - 1).setOperators(self._fine, self._fine)
         for n, part in enumerate(parts[: levels - 1]):
             self._tell(levels - 1 - n, part)

@@ -81,6 +81,14 @@ def add_to_composite(composite: PETSc.Mat, part: PETSc.Mat) -> None:
         raise PETSc.Error
 
 
+def set_mg_residual(pc: PETSc.PC, level: int, operator: PETSc.Mat) -> None:
+    """Give a level of PCMG the matrix of its residuals: it keeps that of its first set-up else. Collective."""
+    function = _library().PCMGSetResidual
+    function.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
+    if function(pc.handle, level, None, operator.handle):
+        raise PETSc.Error
+
+
 def gather_triplets(
     comm: MPI.Comm, rows: Layout, i: np.ndarray, j: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

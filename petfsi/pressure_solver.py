@@ -130,7 +130,8 @@ class PressureSolver:
             return True
         if self._change <= 0:
             return True
-        versions = [coupling.pattern_version for coupling in self.system.couplings]
+        versions = [field.pattern_version for field in self.system.fields]
+        versions += [coupling.pattern_version for coupling in self.system.couplings]
         self._first_iterations = self._first_iterations or iterations
         now = np.concatenate([field.block.getDiagonal().array_r for field in self.system.fields])
         stale = versions != self._versions or iterations > self._growth * self._first_iterations
@@ -143,7 +144,8 @@ class PressureSolver:
 
     def _pass_on(self, stale: bool = True) -> None:
         if stale and self._multigrid is not None:
-            self._multigrid.refresh(self.fluid.block, self.stand_in.walls if self.stand_in is not None else None)
+            walls = self.stand_in.walls if self.stand_in is not None else None
+            self._multigrid.refresh(self.fluid.block, walls, self.fluid.pattern_version)
         if self.eliminates and self._ksp is not None:
             schur = self._ksp.getOperators()[0]
             schur.setNullSpace(self.fluid.block.getNullSpace())

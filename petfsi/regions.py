@@ -6,7 +6,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.fields.base import FluidField
+from petfsi.fields.base import FluidField, Reader, Slab
 from petfsi.system import System
 
 
@@ -25,6 +25,12 @@ class ClosedRegions:
         The fluid.
     decoupled : bool
         Whether the pressure block is inverted by itself.
+
+    Attributes
+    ----------
+    volumes : ndarray
+        Of each region that was closed at the first ``refresh``, m^3 (m^2 in 2D), for the geometry of the last one; nan
+        from when it was opened, divided, joined with another or filled.
     """
 
     def __init__(self, system: System, fluid: FluidField, decoupled: bool) -> None:
@@ -33,6 +39,8 @@ class ClosedRegions:
         self.decoupled = decoupled
         self._members: list[np.ndarray] = []
         self._volumes = np.zeros(0)
+        self.volumes = np.zeros(0)
+        self._number: np.ndarray | None = None
         self._found_for: tuple[int, ...] | None = None
 
     def adopt(self, system: System) -> None:
@@ -50,7 +58,12 @@ class ClosedRegions:
         regions = fluid.closed_regions(touched)
         self._members = [member for member, _ in regions]
         volumes = fluid.volumes()
-        self._volumes = system.comm.allreduce(np.array([member @ volumes for member in self._members]))
+        sizes = np.array([member @ volumes for member in self._members])
+        if self._number is None:
+            self._volumes = self.volumes = system.comm.allreduce(sizes)
+            self._number = self._present()
+        else:
+            self._follow(sizes)
         rigid = [member for member, touches_solid in regions if not touches_solid]
         _attach(fluid.block, self._members if self.decoupled else rigid)
         if system.index_sets:
@@ -58,6 +71,45 @@ class ClosedRegions:
             for row, member in zip(whole, rigid, strict=True):
                 row[system.piece(fluid.name)] = member
             _attach(system.operator, list(whole))
+
+    def _present(self) -> np.ndarray:
+        """Return which of the present regions each lasting unknown lies in, counted from 1; 0 is none."""
+        here = np.zeros(self.fluid.n_cells)
+        for number, member in enumerate(self._members, start=1):
+            here += number * member[: self.fluid.n_cells]
+        return here
+
+    def _follow(self, sizes: np.ndarray) -> None:
+        """Find which of the first regions the present ones are: those that share cells with each other alone.
+
+        Parameters
+        ----------
+        sizes : ndarray
+            This rank's part of the present volumes. Collective: one reduction.
+        """
+        assert self._number is not None
+        present, n_old, n_new = self._present(), len(self.volumes), len(sizes)
+        pairs = (self._number * (n_new + 1) + present).astype(np.int64)
+        shared = np.bincount(pairs, minlength=(n_old + 1) * (n_new + 1))
+        total = self.system.comm.allreduce(np.concatenate((sizes, shared)))
+        self._volumes = total[:n_new]
+        meets = total[n_new:].reshape(n_old + 1, n_new + 1)[1:, 1:] > 0
+        same = meets & (meets.sum(axis=0) == 1) & (meets.sum(axis=1) == 1)[:, None]
+        old, new = np.nonzero(same)
+        self.volumes = np.full(n_old, np.nan)
+        self.volumes[old] = self._volumes[new]
+        renumbered = np.zeros(n_new + 1)
+        renumbered[new + 1] = old + 1
+        self._number = renumbered[present.astype(np.int64)]
+
+    def state(self) -> dict[str, Slab]:
+        """Return where the first regions are now."""
+        assert self._number is not None
+        return {"region": self.fluid.cells_slab(self._number)}
+
+    def restore(self, read: Reader) -> None:
+        """Take up a state. Collective."""
+        self._number, self._found_for = self.fluid.read_cells(read, "region"), None
 
     def volume_error(self, dt: float) -> float:
         """Return the largest relative change of a region's volume in the last step, |sum of net outflows| dt / V.

@@ -32,7 +32,7 @@ from petfsi.simulation import Simulation
 DONE, STOPPED = 0, 75
 Status = Literal["done", "stopped", "failed"]
 
-#: What a row of history.csv says besides the probes and the solver.
+#: What a row of history.csv says besides the probes, the solver and the accounts.
 ACCOUNTS = ("volume_error", "divergence")
 
 
@@ -87,7 +87,8 @@ class Run:
     def open(self, after: int | None = None) -> None:
         """Open what the run writes; of a run that goes on drop all after a step. Collective."""
         simulation = self.simulation
-        self.history = History(self.files.history, column_names(simulation.probe_columns(), ACCOUNTS), self.comm)
+        columns = column_names(simulation.probe_columns(), [*ACCOUNTS, *simulation.accounts.columns])
+        self.history = History(self.files.history, columns, self.comm)
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
         if after is not None:
             self.history.truncate(after)
@@ -178,6 +179,7 @@ class Run:
                 "residual": simulation.outcome.residual,
                 "volume_error": simulation.volume_error,
                 "divergence": simulation.divergence(),
+                **simulation.accounts.values,
             }
         )
 
@@ -223,7 +225,7 @@ class Run:
             phases=simulation.phases,
             iterations={"mean": float(np.mean(iterations)), "max": max(iterations)},
             assemblies=simulation.assemblies(),
-            conservation={"volume_error": self.volume_error},
+            conservation={"volume_error": self.volume_error, **simulation.accounts.values},
             probes=self.probes,
             skipped=skipped(simulation.scene),
             versions=versions(),
@@ -295,8 +297,7 @@ def resume_run(
         unread = simulation.prepare()  # of the scene's start: it would move the fluid's faces to the restored solid
         simulation.solver.reset()
         with checkpoints.read_checkpoint(found, comm) as stored:
-            groups = {field.name: stored.group(field.name) for field in simulation.fields}
-            simulation.restore(stored.step, stored.time, stored.dt, groups)
+            simulation.restore(stored.step, stored.time, stored.dt, stored.group)
         _greet(console, simulation, unread)
         console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
         run = Run(simulation, files, console)

@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi import build
+from petfsi.accounts import Accounts
 from petfsi.errors import SolveError
 from petfsi.fields.base import FluidField, Reader, Slab, SolidField
 from petfsi.regions import ClosedRegions
@@ -33,6 +34,8 @@ class Simulation:
     volume_error : float
         Largest relative change of a closed region's fluid volume in the last step, |sum of net outflows| h / V.
         A split solve spreads a compatible correction over the region: then this is its size.
+    accounts : Accounts
+        Momentum, energy and volumes, from ``prepare`` on.
     phases : dict
         Seconds spent in each of the six phases.
     """
@@ -51,6 +54,7 @@ class Simulation:
         self.system = System(comm, self.fields, self.couplings)
         self.solver = Solver(self.system)
         self.regions = ClosedRegions(self.system, self.fluid, self.solver.decoupled) if self.fluid else None
+        self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
@@ -100,6 +104,7 @@ class Simulation:
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
         self._assemble(self.time, self.dt)
+        self.accounts.start()
         return self.solver.check_options()
 
     def _assemble(self, t: float, dt: float) -> bool:
@@ -127,6 +132,7 @@ class Simulation:
             coupling.accept(t, dt)
         if self.fluid:
             self.fluid.accept(values["pressure"], t, dt)
+        self.accounts.update(values.get("pressure"), dt)
 
     def _check_speed(self, solid: SolidField, velocity: np.ndarray) -> None:
         """Raise if a node would cross the whole scene in one step: the state has blown up."""
@@ -181,11 +187,21 @@ class Simulation:
         }
 
     def state(self) -> dict[str, dict[str, Slab]]:
-        """Return all that the next step reads, by field."""
-        return {field.name: field.state() for field in self.fields}
+        """Return all that the next step reads, by field, and what accounts add to."""
+        accounts = {"accounts": self.accounts.state()} if self.accounts.columns else {}
+        return {field.name: field.state() for field in self.fields} | accounts
 
-    def restore(self, step: int, time: float, dt: float, readers: dict[str, Reader]) -> None:
-        """Take up the state of a checkpoint. Collective."""
+    def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:
+        """Take up the state of a checkpoint; ``prepare`` comes first. Collective.
+
+        Parameters
+        ----------
+        step, time, dt : int, float, float
+        group : callable
+            Returns the reader of a group of ``state`` by its name.
+        """
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
-            field.restore(readers[field.name])
+            field.restore(group(field.name))
+        if self.accounts.columns:
+            self.accounts.restore(group("accounts"))

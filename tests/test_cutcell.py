@@ -112,9 +112,7 @@ def test_a_fluid_at_rest_stays_and_carries_what_is_displaced(name, integrator):
 def test_a_floating_solid_carries_its_draught():
     shape = box([0.3, 0.67], [0.4, 0.6], [4, 6])  # through the open top
     solid = {"shape": shape, "supports": held(2)}
-    with simulation(
-        MPI.COMM_SELF, make_scene(2, [20, 20], [1.0, 1.0], solid, {"top": "open"}, [0, -G]), DIRECT
-    ) as sim:
+    with simulation(MPI.COMM_SELF, make_scene(2, [20, 20], [1.0, 1.0], solid, {"top": "open"}, [0, -G]), DIRECT) as sim:
         sim.advance()
         assert all(np.abs(v).max() < 1e-10 for v in sim.fluid.velocity)
         assert buoyancy(sim) == pytest.approx([0.0, RHO * G * 0.4 * 0.33], rel=1e-9, abs=1e-6)

@@ -204,8 +204,20 @@ def test_a_tank_without_solids_has_no_nest_and_assembles_once(tmp_path):
 def test_a_solid_alone_has_no_fluid(tmp_path):
     petfsi("run", SCENES / "beam.toml", "--out", tmp_path / "run")
     told = summary(tmp_path / "run")
+    accounts = ["momentum.x", "momentum.y", "kinetic", "elastic", "potential", "dissipated", "boundary_work"]
+    assert list(told["conservation"]) == ["volume_error", *accounts, "energy_residual"]
+    history = read_history(tmp_path / "run" / "history.csv")
+    assert list(history)[-8:] == [*accounts, "energy_residual"]
+    assert history["energy_residual"][-1] == told["conservation"]["energy_residual"]
     assert told["unknowns"].keys() == {"solid"}
     assert any("no [fluid]" in line for line in told["skipped"])
+
+
+def test_a_run_without_accounts_has_no_columns_for_them(tmp_path):
+    petfsi("run", SCENES / "tank.toml", "--out", tmp_path / "run", "--steps", 2, "--set", "output.accounts=false")
+    petfsi("resume", tmp_path / "run", "--steps", 1)
+    assert list(read_history(tmp_path / "run" / "history.csv"))[-2:] == ["volume_error", "divergence"]
+    assert list(summary(tmp_path / "run")["conservation"]) == ["volume_error"]
 
 
 def test_a_solid_that_cannot_move_is_coupled_once(tmp_path):
@@ -223,3 +235,5 @@ def test_a_closed_cavity_keeps_its_volume(tmp_path):
     history = read_history(tmp_path / "run" / "history.csv")
     assert np.abs(history["lid.y"]).max() > 1e-3  # it does move
     assert history["volume_error"][1:].max() < 1e-9
+    # of the geometry itself: what is left is the mesh's step of first order
+    np.testing.assert_allclose(history["region_volume.1"], 0.25, rtol=1e-3)

@@ -7,6 +7,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 from petsc4py import PETSc
 
+from petfsi.fields.base import Work
+
 
 class Coupling(ABC):
     """Joins two fields; neither of them knows of it.
@@ -42,6 +44,19 @@ class Coupling(ABC):
         """Fill the blocks (only if they changed) and add what is known to the fields' ``rhs``. Collective.
 
         To be called after the fields have assembled the step from ``time`` to ``time + dt``.
+        """
+
+    @abstractmethod
+    def work(self, pressure: np.ndarray, dt: float) -> Work:
+        """Return this rank's share of what the coupling's own forces did in the step last accepted.
+
+        Supports bear the pressure on prescribed points, and the fluid's weight there: minus that is their work.
+
+        Parameters
+        ----------
+        pressure : ndarray
+            The step's solution, Pa.
+        dt : float
         """
 
     @abstractmethod

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
-from petfsi.fields.base import SolidField
+from petfsi.fields.base import SolidField, Work
 from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
 from petfsi.scene import schema
 
@@ -43,6 +43,8 @@ class CutCellCoupling(Coupling):
         self._positions: np.ndarray | None = None
         self._patterns: list[tuple[np.ndarray, ...]] = []
         self._stale, self._dt = False, 0.0
+        self._held = np.zeros(self.surface.point_map.shape[0])
+        self._held_outflow = np.zeros(0)
 
     def _new_blocks(self) -> None:
         fluid, solid = self.fluid, self.solid
@@ -88,8 +90,8 @@ class CutCellCoupling(Coupling):
         points = (self.facets[wet.facet] * dim)[:, :, None] + np.arange(dim)
         rows = np.repeat(points.ravel(), dim)
         columns = np.tile(np.arange(dim), points.size)
-        by_point = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))
-        force = (self._free_map.T @ by_point).tocoo()
+        self._point_weight = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))
+        force = (self._free_map.T @ self._point_weight).tocoo()
         columns = force.col.astype(np.int64)
         indptr, indices, values = gather_triplets(self.comm, layout, self._free[force.row], columns, force.data)
         return csr_matrix((values, indices, indptr), shape=(layout.n_local, dim))
@@ -103,7 +105,9 @@ class CutCellCoupling(Coupling):
             self._fill()
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
-            self.fluid.rhs -= self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+            self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
+            self._held_outflow = self._point_flux @ self._held
+            self.fluid.rhs -= self._held_outflow
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
 
@@ -119,6 +123,16 @@ class CutCellCoupling(Coupling):
         self._patterns = patterns
         self.pattern_version += new > 0
         self.n_assembled += 1
+
+    def work(self, pressure: np.ndarray, dt: float) -> Work:
+        """Return the work of the fluid's weight on all points, and what supports do against it and the pressure."""
+        held = free = 0.0
+        if self.fluid.weight is not None:
+            gradient = self.fluid.weight.gradient
+            free = float(self.solid.moved @ (self._weight @ gradient))
+            held = dt * float(self._held @ (self._point_weight @ gradient))
+        pressed = dt * float(pressure @ self._held_outflow) if len(self._held_outflow) else 0.0
+        return Work(gravity=free + held, boundary=-pressed - held)
 
     def accept(self, time: float, dt: float) -> None:
         """Do nothing: no face takes its velocity from the solid."""

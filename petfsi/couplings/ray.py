@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
-from petfsi.fields.base import SolidField
+from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.kinds import FLUID, SOLID, SOLID_FACE, VOID
 from petfsi.geometry import rays
 from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
@@ -70,6 +70,7 @@ class RayCoupling(Coupling):
         self._rows: list[Rows] = []
         self._patterns: list[tuple[np.ndarray, ...]] = []
         self._stale, self._dt = False, 0.0
+        self._held_outflow = np.zeros(0)
 
     # ---- couple ---------------------------------------------------------------------------------------------
 
@@ -231,7 +232,13 @@ class RayCoupling(Coupling):
             self.n_assembled += 1
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
-            self.fluid.rhs -= self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+            self._held_outflow = self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+            self.fluid.rhs -= self._held_outflow
+
+    def work(self, pressure: np.ndarray, dt: float) -> Work:
+        """Return what supports do against the pressure, as the fluid feels it."""
+        held = self._held_outflow
+        return Work(boundary=-dt * float(pressure @ held) if len(held) else 0.0)
 
     def accept(self, time: float, dt: float) -> None:
         """Give the faces that the solid took its new velocity, in ghosts, too."""

@@ -39,6 +39,42 @@ def scalar_slab(comm: MPI.Comm, value: float) -> Slab:
     return Slab(np.array([value] if mine else []), (0 if mine else 1,), (1,))
 
 
+@dataclass(frozen=True)
+class Stock:
+    """What a field holds, this rank's share.
+
+    Attributes
+    ----------
+    momentum : ndarray, shape (dim,)
+        kg m/s.
+    kinetic, elastic : float
+        J.
+    """
+
+    momentum: np.ndarray
+    kinetic: float
+    elastic: float = 0.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the last step's forces did, this rank's share, J.
+
+    Attributes
+    ----------
+    gravity : float
+        Done by gravity.
+    damping : float
+        Taken by damping.
+    boundary : float
+        Done, and brought along, by all that lies beyond: supports, inflows, open sides.
+    """
+
+    gravity: float = 0.0
+    damping: float = 0.0
+    boundary: float = 0.0
+
+
 #: Reads the piece ``[start, start + count)`` of the stored array of that name: ``read(name, start, count)``.
 Reader = Callable[[str, tuple[int, ...], tuple[int, ...]], np.ndarray]
 
@@ -61,6 +97,8 @@ class Field(ABC):
         rows and unknowns are comparable numbers.
     n_assembled : int
         How often the block was assembled.
+    pattern_version : int
+        Grows whenever the pattern of the block changes; the same on all ranks.
     """
 
     name: str
@@ -70,6 +108,7 @@ class Field(ABC):
     row_scale: float = 1.0
     col_scale: float = 1.0
     n_assembled: int = 0
+    pattern_version: int = 0
 
     @abstractmethod
     def unknown(self) -> np.ndarray:
@@ -86,6 +125,14 @@ class Field(ABC):
     @abstractmethod
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the solution (SI) of the step from ``time`` to ``time + dt`` and move all that moves with it."""
+
+    @abstractmethod
+    def stock(self) -> Stock:
+        """Return this rank's share of momentum and energy. Collective, without a reduction."""
+
+    @abstractmethod
+    def work(self, dt: float) -> Work:
+        """Return this rank's share of what was done in the step last accepted. Collective, without a reduction."""
 
     @abstractmethod
     def output(self) -> dict[str, Slab]:
@@ -113,11 +160,14 @@ class FluidField(Field):
         Volume of a typical cell, m^3 (m^2 in 2D).
     geometry_version : int
         Grows whenever cells or faces change their kind; the same on all ranks.
+    n_cells : int
+        So many of this rank's unknowns, the first ones, are there for the whole run; the others come and go.
     """
 
     comm: MPI.Comm
     density: float
     cell_volume: float
+    n_cells: int
     geometry_version: int = 0
 
     @abstractmethod
@@ -132,6 +182,14 @@ class FluidField(Field):
         """Return the volume of fluid that belongs to each of this rank's unknowns, m^3 (m^2 in 2D)."""
 
     @abstractmethod
+    def cells_slab(self, values: np.ndarray) -> Slab:
+        """Return a value per lasting unknown, shape (n_cells,), as a piece of a global array."""
+
+    @abstractmethod
+    def read_cells(self, read: Reader, name: str) -> np.ndarray:
+        """Return what ``cells_slab`` stored, shape (n_cells,), on any number of ranks."""
+
+    @abstractmethod
     def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
         """Return a quantity at a point, the same on all ranks. Collective."""
 
@@ -143,9 +201,12 @@ class SolidField(Field):
     ----------
     extent : float
         Largest side of its bounding box at rest, m.
+    moved : ndarray, shape (layout.n_local,)
+        By how much this rank's nodes moved in the step last accepted, m.
     """
 
     extent: float
+    moved: np.ndarray
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:

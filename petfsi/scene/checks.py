@@ -34,8 +34,11 @@ MAX_STEPS = 10**8
 OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
 SOLID_QUANTITIES = ("displacement", "velocity")
 NO_Z = "bounds z, which dim = 2 does not have"
-#: Columns of history.csv, which a scalar probe must not repeat.
-RESERVED_PROBES = ("step", "time", "dt", "iterations", "residual", "volume_error", "divergence")
+#: Columns of history.csv, which a probe must not repeat.
+RESERVED_PROBES = (
+    "step", "time", "dt", "iterations", "residual", "volume_error", "divergence", "region_volume", "momentum",
+    "kinetic", "elastic", "potential", "dissipated", "boundary_work", "energy_residual",
+)  # fmt: skip
 
 
 def problems(scene: Scene) -> list[Problem]:

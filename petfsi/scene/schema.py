@@ -285,9 +285,10 @@ class Probe(Table):
 
 
 class Output(Table):
-    """When fields are written; none means never."""
+    """When fields are written (none means never), and whether history.csv accounts for momentum, energy and volumes."""
 
     every: Annotated[Annotated[Real, Field(gt=0)] | None, Field(description="s")] = None
+    accounts: bool = True
 
 
 class Checkpoint(Table):

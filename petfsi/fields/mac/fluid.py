@@ -8,8 +8,8 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError
-from petfsi.fields.base import FluidField, Reader, Slab, scalar_slab
-from petfsi.fields.mac import advect, kinds, pressure, views
+from petfsi.fields.base import FluidField, Reader, Slab, Stock, Work, scalar_slab
+from petfsi.fields.mac import advect, budget, kinds, pressure, views
 from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
@@ -65,7 +65,7 @@ class MacFluid(FluidField):
             raise InputError(f"fluid.cells = {fluid.cells}: a periodic axis needs at least 3 cells")
         self.grid = grid = MacGrid(comm, fluid.origin, fluid.size, fluid.cells, periodic)
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
-        self.cell_volume = grid.cell_volume
+        self.cell_volume, self.n_cells = grid.cell_volume, grid.layout.n_local
         self.surroundings = Surroundings(grid, fluid.sides)
         advection = Advection(grid, self.surroundings, fluid.advection)
         self._transport = TRANSPORTS[scene.time.integrator](advection)
@@ -86,6 +86,7 @@ class MacFluid(FluidField):
         self.index = grid.index
         self.extras: Extras | None = None
         self._extra_pressure = np.zeros(0)
+        self._forces: budget.Forces | None = None
         self._other_pressure: np.ndarray | None = None
         self.volume: np.ndarray | None = None
         self.geometry_version = self.kinds_version = 0
@@ -296,12 +297,16 @@ class MacFluid(FluidField):
         buoyancy = 0.0
         if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
             buoyancy = self.scene.fluid.smoke.buoyancy
+        gravity = np.array([float(g(t=time)) for g in self._gravity])
+        self._forces = budget.Forces.of(
+            gravity, [self.weight is None or p for p in self.grid.periodic], buoyancy, smoke
+        )
         if self.weight is not None:
             self.weight.at(time)
             self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
         for axis in self._axes:
             star, kind = self.velocity_star[axis], self.face_kind[axis]
-            dv = duration * float(self._gravity[axis](t=time))
+            dv = duration * gravity[axis]
             pressure.add_forces(
                 star,
                 self.boundary_velocity[axis],
@@ -351,6 +356,7 @@ class MacFluid(FluidField):
         if self.extras is not None:
             rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
         set_csr(self.block, *rows, new_pattern=self._new_pattern)
+        self.pattern_version += self._new_pattern
         self._new_pattern = False
         self._assembled_for = (self.geometry_version, factor)
         self.n_assembled += 1
@@ -425,6 +431,38 @@ class MacFluid(FluidField):
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
         most = max(advect.largest(v) * dt / h for v, h in zip(self.velocity, self.grid.dx, strict=True))
         return self.comm.allreduce(most, op=MPI.MAX)
+
+    def stock(self) -> Stock:
+        """Return this rank's share of momentum and kinetic energy of the faces that the pressure acts on.
+
+        A face has the mass rho B_f A_f dx, one at an open side half of it. The velocity is that after the step's
+        kick, see ``transport``.
+        """
+        velocity = self._transport.kicked(self.velocity)
+        return budget.stock(self.grid, self.density, velocity, self.face_kind, self.openness, self.extras)
+
+    def work(self, dt: float) -> Work:
+        """Return this rank's share of what was done in the step last accepted, see ``budget``."""
+        velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
+        gravity = 0.0
+        if self._forces is not None:
+            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self._forces)
+        into = budget.inflow(
+            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight
+        )  # fmt: skip
+        return Work(gravity=gravity, boundary=dt * into)
+
+    def cells_slab(self, values: np.ndarray) -> Slab:
+        """Return a value per cell, in the DMDA's order, as a piece of a global array."""
+        array = self.grid.zeros_cells()
+        self.grid.from_vec(values, array)
+        return self.grid.slab(array, None)
+
+    def read_cells(self, read: Reader, name: str) -> np.ndarray:
+        """Return what ``cells_slab`` stored. Collective."""
+        array = self.grid.zeros_cells()
+        self.grid.read_slab(read, name, array, None)
+        return self.grid.to_vec(array)
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy of the fluid cells, J (in 2D per metre of thickness). Collective."""

@@ -153,6 +153,14 @@ class Transport:
         """Return how long after the step's begin v_w holds, s."""
         return self.integrator.moment(dt)
 
+    def solved(self, velocity: Faces) -> Faces:
+        """Return v_w of the last step, which has no divergence, given the velocity at its end."""
+        return velocity
+
+    def kicked(self, velocity: Faces) -> Faces:
+        """Return what the last step's forces left, whose energy they changed, given the velocity at its end."""
+        return velocity
+
     def half_way(self, velocity: Faces, dt: float) -> Faces:
         """Return the flow that carries from the step's begin to its end, given that at its begin."""
         return velocity
@@ -265,6 +273,14 @@ class MidpointTransport(Transport):
         self.scheme = self.integrator = Midpoint()
         self._carried: Faces = []
 
+    def solved(self, velocity: Faces) -> Faces:
+        """Return the velocity in the middle of the last step."""
+        return self.past["velocity_middle"] if self.past_dt else velocity
+
+    def kicked(self, velocity: Faces) -> Faces:
+        """Return v'' of the last step."""
+        return self.past["velocity_kicked"] if self.past_dt else velocity
+
     def half_way(self, velocity: Faces, dt: float) -> Faces:
         """Return the velocity in the middle of the coming step."""
         return self._at(velocity, dt / 2)
@@ -278,8 +294,7 @@ class MidpointTransport(Transport):
         """Write v' into the owned part of ``star``, and keep it for the kick. Collective."""
         between = (self.past_dt + dt) / 2
         path = self.advection.path(self._at(velocity, (dt - self.past_dt) / 4), between)
-        kicked = self.past["velocity_kicked"] if self.past_dt else velocity
-        for axis, v in enumerate(kicked):
+        for axis, v in enumerate(self.kicked(velocity)):
             self.advection.carry(v, path, moved[axis], axis, star[axis])
         self._carried = [v.copy() for v in star]
 

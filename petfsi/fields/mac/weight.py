@@ -46,9 +46,10 @@ class Weight:
 
     def pressure(self) -> np.ndarray:
         """Return rho g . (x - x_0) in all local cells, Pa."""
-        return self._on(self.grid.coordinates(None))
+        return self.on(self.grid.coordinates(None))
 
-    def _on(self, coordinates: list[np.ndarray]) -> np.ndarray:
+    def on(self, coordinates: list[np.ndarray]) -> np.ndarray:
+        """Return rho g . (x - x_0) at points by their x, y, z, which broadcast, Pa."""
         total = np.zeros(np.broadcast_shapes(*(x.shape for x in coordinates)))
         for a in range(self.grid.dim):
             total = total + self.gradient[a] * (coordinates[a] - self.origin[a])
@@ -64,6 +65,6 @@ class Weight:
                     continue
                 part = tuple(slice(plane, plane + 1) if b == a else slice(None) for b in range(3))
                 lines = [x[s] for x, s in zip(grid.lines(a), part, strict=True)]
-                p = -self._on(list(np.meshgrid(*lines, indexing="ij", sparse=True)))
+                p = -self.on(list(np.meshgrid(*lines, indexing="ij", sparse=True)))
                 push = (-2.0 if upper else 2.0) * duration / (self.density * grid.dx[a])
                 star[a][part] += np.where(face_kind[a][part] == OPEN, push * p, 0.0)

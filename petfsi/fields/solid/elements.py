@@ -146,11 +146,40 @@ class Elements:
         for begin, end, body in self.chunks():
             V = np.where(counted[begin:end], self.volume[begin:end], 0.0)
             elastic += float(V @ self.respond(d, begin, end, body)[0])
-            v = u[self.cells[begin:end]]
-            on, off = self.mass_factors[body]
-            squares = (on - off) * np.einsum("eai,eai->e", v, v) + off * np.sum(v.sum(axis=1) ** 2, axis=1)
-            kinetic += float(0.5 * self.bodies.density[body] * (V @ squares))
+            mass = self.bodies.density[body] * self.mass_factors[body]
+            kinetic += 0.5 * self._kernels.mass_product(self.cells[begin:end], V, mass, u, u)
         return kinetic, elastic
+
+    def powers(
+        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
+    ) -> tuple[float, float]:
+        """Return two powers of a step's forces, over the counted elements, W. Not collective.
+
+        The damping's  w . C w,  and that of the residual of A w - b without loads,
+
+            g . (M (a w - V) + C w + K(d) + K'(d) (s + k w)) .
+
+        Parameters
+        ----------
+        at : State
+            d, V, s at all local nodes.
+        a, k : float
+            1/s, s.
+        w, g : ndarray, shape (n, dim)
+            The solution, and any other velocity, m/s.
+        counted : ndarray of bool, shape (ne,)
+        """
+        damping = power = 0.0
+        for begin, end, body in self.chunks():
+            part = slice(begin, end)
+            _, P, C = self.respond(at.displacement, begin, end, body)
+            lost, done = self._kernels.powers(
+                self.cells[part], self.gradients[part], np.where(counted[part], self.volume[part], 0.0), P, C,
+                at.inertia, at.shift, w, g, self.bodies.density[body] * self.mass_factors[body], (a, k),
+                (self.bodies.mass_damping[body], self.bodies.stiffness_damping[body]),
+            )  # fmt: skip
+            damping, power = damping + lost, power + done
+        return damping, power
 
     def nodal_mass(self, n: int) -> np.ndarray:
         """Return the mass of each of the first ``n`` nodes: the row sums of M, in kg."""
@@ -211,7 +240,45 @@ def _compile(dim: int) -> SimpleNamespace:
                             for J in range(dim):
                                 b[row, i] -= V * P[e, i, J] * gradients[e, a, J]
 
-    return SimpleNamespace(gradient=gradient, scatter=scatter)
+    @njit(cache=True)
+    def mass_product(cells, volume, mass, u, v):
+        total = 0.0
+        for e in range(cells.shape[0]):
+            for i in range(dim):
+                same = sum_u = sum_v = 0.0
+                for a in range(dim + 1):
+                    same += u[cells[e, a], i] * v[cells[e, a], i]
+                    sum_u += u[cells[e, a], i]
+                    sum_v += v[cells[e, a], i]
+                total += volume[e] * ((mass[0] - mass[1]) * same + mass[1] * sum_u * sum_v)
+        return total
+
+    @njit(cache=True)
+    def powers(cells, gradients, volume, P, C, inertia, shift, w, g, mass, factors, damping):
+        (a, k), (a0, a1) = factors, damping
+        lost = a0 * mass_product(cells, volume, mass, w, w)
+        done = (a + a0) * mass_product(cells, volume, mass, g, w) - mass_product(cells, volume, mass, g, inertia)
+        slope_w, slope_s, slope_g = np.empty((dim, dim)), np.empty((dim, dim)), np.empty((dim, dim))
+        for e in range(cells.shape[0]):
+            for i in range(dim):
+                for J in range(dim):
+                    slope_w[i, J] = slope_s[i, J] = slope_g[i, J] = 0.0
+                    for q in range(dim + 1):
+                        slope_w[i, J] += w[cells[e, q], i] * gradients[e, q, J]
+                        slope_s[i, J] += shift[cells[e, q], i] * gradients[e, q, J]
+                        slope_g[i, J] += g[cells[e, q], i] * gradients[e, q, J]
+            for i in range(dim):
+                for J in range(dim):
+                    rate = moved = 0.0
+                    for m in range(dim):
+                        for L in range(dim):
+                            rate += C[e, i, J, m, L] * slope_w[m, L]
+                            moved += C[e, i, J, m, L] * slope_s[m, L]
+                    lost += volume[e] * a1 * rate * slope_w[i, J]
+                    done += volume[e] * (P[e, i, J] + moved + (k + a1) * rate) * slope_g[i, J]
+        return lost, done
+
+    return SimpleNamespace(gradient=gradient, scatter=scatter, mass_product=mass_product, powers=powers)
 
 
 _KERNELS = {2: _compile(2), 3: _compile(3)}

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Reader, Slab, SolidField, scalar_slab
+from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.elements import Bodies, Elements, State
 from petfsi.fields.solid.materials import MATERIALS, lame_parameters
 from petfsi.fields.solid.partition import Fetch, distribute, slab
@@ -73,12 +73,18 @@ class SimplexSolid(SolidField):
         thrown = {name: ("velocity", start.velocity) for name, start in initial.items()}
         self.displacement = _evaluate(moved, mesh.points, node_body)[mine]
         self.velocity = _evaluate(thrown, mesh.points, node_body)[mine]
+        self.moved = np.zeros(self.layout.n_local)
         self._stage: Stage | None = None
+        self._loaded: tuple[Stage, State, np.ndarray] | None = None
         self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
         self._past_dt = 0.0
         self._prescribed = self._supports.velocities(0.0).copy()
         held = self._supports.unknowns
         here = (held >= self.layout.start) & (held < self.layout.end)
+        local = self.dim * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.dim)
+        self._is_held = np.isin(local, held)
+        damping = [(solid.damping.mass, solid.damping.stiffness) for solid in scene.solids.values()]
+        self._loses = self._supports.move or bool(np.any(damping))
         self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
 
     # ---- set-up -----------------------------------------------------------------------------------------------
@@ -155,8 +161,11 @@ class SimplexSolid(SolidField):
         local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
         state = State(*(local[:, n * self.dim : (n + 1) * self.dim] for n in range(3)))
         self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
+        gravity = np.zeros(self.dim)
         for axis, g in enumerate(self._gravity):
-            b[:, axis] += self._nodal_mass * float(g(t=time + self._integrator.moment(dt)))
+            gravity[axis] = float(g(t=time + self._integrator.moment(dt)))
+            b[:, axis] += self._nodal_mass * gravity[axis]
+        self._loaded = stage, state, gravity
         self._prescribe(time, dt)
         self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
         set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
@@ -168,6 +177,7 @@ class SimplexSolid(SolidField):
         w, motion = x.reshape(-1, self.dim).copy(), self._motion()
         stage = self._stage or self._integrator.stage(motion, dt)
         motion = self._integrator.finish(motion, stage, w, dt)
+        self.moved = (motion.displacement - self.displacement).ravel()
         self.displacement, self.velocity = motion.displacement, motion.velocity
         self._past, self._past_dt = motion.past, motion.past_dt
         self._stage = None
@@ -260,6 +270,30 @@ class SimplexSolid(SolidField):
         return values
 
     # ---- what others read -------------------------------------------------------------------------------------
+
+    def stock(self) -> Stock:
+        """Return this rank's share of momentum, kinetic and elastic energy."""
+        d, u = np.split(self._with_shared(np.concatenate((self.displacement, self.velocity), axis=1)), 2, axis=1)
+        kinetic, elastic = self._elements.energies(d, u, self._mesh.counted)
+        return Stock(self._nodal_mass @ self.velocity, kinetic, elastic)
+
+    def work(self, dt: float) -> Work:
+        """Return this rank's share of what was done in the step last accepted.
+
+        Gravity acts along the way that nodes moved; damping (w . C w) and supports, with the reaction that is the
+        residual of their equations without other fields' forces, act at w for dt.
+        """
+        if self._loaded is None:
+            return Work()
+        stage, state, gravity = self._loaded
+        fallen = float(self._nodal_mass @ self.moved.reshape(-1, self.dim) @ gravity)
+        if not self._loses:
+            return Work(gravity=fallen)
+        w = self._with_shared(self._integrator.solved(self._motion()))
+        g = np.where(self._is_held, w, 0.0)
+        damping, power = self._elements.powers(state, stage.a, stage.k, w, g, self._mesh.counted)
+        power -= float(self._nodal_mass @ g[: self._mesh.n_owned] @ gravity)
+        return Work(fallen, dt * damping, dt * power)
 
     def energies(self) -> dict[str, float]:
         """Return the kinetic and elastic energy of all bodies, J (per metre in 2D). Collective."""

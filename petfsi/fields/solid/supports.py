@@ -59,6 +59,11 @@ class Supports:
                 coordinates = dict(zip("xyz", where[entries].T, strict=False))
                 self._moving.append((speed, entries, {"z": 0.0, **coordinates}))
 
+    @property
+    def move(self) -> bool:
+        """Whether any of them has a velocity other than zero."""
+        return bool(self._moving)
+
     def velocities(self, time: float) -> np.ndarray:
         """Return the prescribed velocity of each of ``unknowns``, m/s."""
         for speed, entries, coordinates in self._moving:

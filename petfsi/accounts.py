@@ -1,0 +1,145 @@
+"""What a scene holds and what it gains and loses: volumes, momentum and energy, a row of them per step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.couplings.base import Coupling
+from petfsi.fields.base import Field, Reader, Slab, SolidField, scalar_slab
+from petfsi.regions import ClosedRegions
+from petfsi.scene.schema import Scene
+
+
+class Accounts:
+    """Keeps the conservation columns of history.csv, at the price of one reduction a step.
+
+    In SI units, in 2D per metre of thickness. Sums over time begin at zero.
+
+    ``region_volume.1``, ...
+        Fluid in each region that was closed at the start, for the geometry at which the step was taken (cut cells:
+        exact for the surface; ray: whole cells). nan once it was opened, divided or joined with another.
+    ``momentum.x``, ...
+        Of the fluid, sum_f m_f v_f with m_f = rho B_f A_f dx over the faces that the pressure acts on (half of it at
+        open sides), and of the solids. Of ``midpoint``, v is what the step's kick left.
+    ``kinetic``
+        sum_f m_f v_f^2 / 2 of the fluid, and the solids' u . M u / 2.
+    ``elastic``
+        Energy stored in the solids.
+    ``potential``
+        Minus the work of gravity so far: on the solids' mass along the way it went, and on the fluid. Cut cells:
+        through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f dt.
+    ``dissipated``
+        What Rayleigh damping took so far, sum w . C w dt, with w where the integrator takes the forces.
+    ``boundary_work``
+        What came in so far: the supports' reactions, the residual of their equations, times w dt; and through
+        inflows and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow.
+    ``energy_residual``
+        kinetic + elastic + potential + dissipated - boundary_work, less its initial value: what the scheme's own
+        damping took (negative) or gave, with advection, cuts that change and what linearising a step leaves out.
+        With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions.
+
+    Columns that a scene has no use for are left out, all of them if ``output.accounts`` is false.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    scene : Scene
+    fields : sequence of Field
+    couplings : sequence of Coupling
+    regions : ClosedRegions or None
+        None without a fluid.
+
+    Attributes
+    ----------
+    columns : list of str
+        Empty before ``start``.
+    values : dict of str to float
+        The present row.
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, scene: Scene, fields: Sequence[Field], couplings: Sequence[Coupling],
+        regions: ClosedRegions | None,
+    ) -> None:  # fmt: skip
+        self.comm, self.fields, self.couplings, self.regions = comm, fields, couplings, regions
+        self.dim, self._wanted, self._heavy = scene.dim, scene.output.accounts, scene.gravity is not None
+        self._elastic = any(isinstance(field, SolidField) for field in fields)
+        self._initial = 0.0
+        self._sums = np.zeros(3)
+        self.values: dict[str, float] = {}
+
+    @property
+    def columns(self) -> list[str]:
+        """The names of the columns, in order."""
+        return list(self.values)
+
+    def start(self) -> None:
+        """Open the books for the present state. Collective."""
+        if self._wanted:
+            self._sums[:] = 0.0
+            self._initial = 0.0
+            self._enter(np.zeros(3))
+            self._initial = self.values["energy_residual"]
+            self.values["energy_residual"] = 0.0
+
+    def update(self, pressure: np.ndarray | None, dt: float) -> None:
+        """Enter the step that was accepted; nothing before ``start``. Collective: one reduction.
+
+        Parameters
+        ----------
+        pressure : ndarray or None
+            The step's solution of the fluid, Pa.
+        dt : float
+        """
+        if not self.values:
+            return
+        parts = [field.work(dt) for field in self.fields]
+        if pressure is not None:
+            parts += [coupling.work(pressure, dt) for coupling in self.couplings]
+        self._enter(np.array([(-part.gravity, part.damping, part.boundary) for part in parts]).sum(axis=0))
+
+    def _enter(self, done: np.ndarray) -> None:
+        """Add up this rank's shares: what was done in a step, and what the fields hold. Collective."""
+        stocks = [field.stock() for field in self.fields]
+        share = np.concatenate([done, *([s.kinetic, s.elastic] for s in stocks), *(s.momentum for s in stocks)])
+        total = np.empty_like(share)
+        self.comm.Allreduce(share, total)
+        self._sums += total[:3]
+        n = len(stocks)
+        kinetic, elastic = total[3 : 3 + 2 * n].reshape(n, 2).sum(axis=0).tolist()
+        momentum = total[3 + 2 * n :].reshape(n, self.dim).sum(axis=0)
+        self._write(kinetic, elastic, momentum)
+
+    def _write(self, kinetic: float, elastic: float, momentum: np.ndarray) -> None:
+        potential, dissipated, boundary_work = self._sums.tolist()
+        volumes = [] if self.regions is None else self.regions.volumes.tolist()
+        self.values = {f"region_volume.{number}": volume for number, volume in enumerate(volumes, start=1)}
+        self.values |= {f"momentum.{axis}": p for axis, p in zip("xyz", momentum.tolist(), strict=False)}
+        self.values["kinetic"] = kinetic
+        if self._elastic:
+            self.values["elastic"] = elastic
+        if self._heavy:
+            self.values["potential"] = potential
+        if self._elastic:
+            self.values["dissipated"] = dissipated
+        self.values["boundary_work"] = boundary_work
+        held = kinetic + elastic + potential + dissipated - boundary_work
+        self.values["energy_residual"] = held - self._initial
+
+    def state(self) -> dict[str, Slab]:
+        """Return the present row, where it began, and where the regions are."""
+        numbers = self.values | {"initial_energy": self._initial}
+        arrays = {name: scalar_slab(self.comm, value) for name, value in numbers.items()}
+        tracked = self.regions is not None and any(name.startswith("region_volume") for name in self.values)
+        return arrays | (self.regions.state() if tracked and self.regions is not None else {})
+
+    def restore(self, read: Reader) -> None:
+        """Take up a state, after ``start``. Collective."""
+        self.values = {name: float(read(name, (0,), (1,))[0]) for name in self.values}
+        self._initial = float(read("initial_energy", (0,), (1,))[0])
+        self._sums[:] = [self.values.get(name, 0.0) for name in ("potential", "dissipated", "boundary_work")]
+        if self.regions is not None and any(name.startswith("region_volume") for name in self.values):
+            self.regions.restore(read)

@@ -1,0 +1,178 @@
+"""What a fluid on a staggered grid holds, and what forces and sides do to it: momentum and energy by faces.
+
+A face that the pressure acts on has the mass m_f = rho B_f A_f dx; at an open side, where p = 0 lies half a cell away,
+it has half of that. With it a step's kick, v_w = v* - (c/rho) G p, does exactly the work of the pressure on all walls:
+
+    sum_f m_f v_w (v_w - v*) / c = - sum_c p_c (outflow of c through walls) - sum_open p_f (outflow) .
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from petfsi.fields.base import Stock
+from petfsi.fields.mac.extras import Extras
+from petfsi.fields.mac.grid import MacGrid
+from petfsi.fields.mac.kinds import OPEN, PRESSURE, STEP, WALL
+from petfsi.fields.mac.weight import Weight
+
+#: An array of faces per axis.
+Faces = list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Forces:
+    """What accelerates the fluid besides the pressure: ``plain + lift * smoke`` by axis, m/s^2.
+
+    Attributes
+    ----------
+    plain, lift : ndarray, shape (dim,)
+    smoke : ndarray or None
+        Cell array; None if there is no lift.
+    """
+
+    plain: np.ndarray
+    lift: np.ndarray
+    smoke: np.ndarray | None
+
+    @classmethod
+    def of(cls, gravity: np.ndarray, heavy: list[bool], buoyancy: float, smoke: np.ndarray | None) -> Forces | None:
+        """Return gravity (along axes where the fluid is ``heavy``) and buoyancy, or None if there is neither."""
+        plain, lift = np.where(heavy[: len(gravity)], gravity, 0.0), -buoyancy * gravity
+        if not np.any(plain) and not np.any(lift):
+            return None
+        return cls(plain, lift, smoke if np.any(lift) else None)
+
+
+def stock(grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness: Faces, extras: Extras | None) -> Stock:
+    """Return this rank's share of momentum and kinetic energy. Not collective."""
+    mass = density * grid.cell_volume
+    momentum, squares = np.zeros(grid.dim), 0.0
+    for a, v in enumerate(velocity):
+        first, second = _moments(kind[a], openness[a], v, _part(grid, a))
+        momentum[a] = mass * first
+        squares += second
+    if extras is not None:
+        # of a split face the mean velocity of its parts is known
+        v = extras.at_faces(velocity)
+        part = np.where((extras.below < 0) | (extras.above < 0), 0.5, 1.0) * extras.openness
+        part = np.where(_owned(grid, extras), part, 0.0)
+        momentum += mass * np.bincount(extras.axis, part * v, minlength=grid.dim)
+        squares += float(part @ v**2)
+    return Stock(momentum, 0.5 * mass * squares)
+
+
+def power(grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness: Faces, forces: Forces) -> float:
+    """Return this rank's share of the power of forces, W; split faces are left out. Not collective."""
+    total = 0.0
+    for a, v in enumerate(velocity):
+        if forces.plain[a] != 0.0:
+            total += forces.plain[a] * _moments(kind[a], openness[a], v, _part(grid, a))[0]
+        if forces.smoke is not None and forces.lift[a] != 0.0:
+            total += forces.lift[a] * _carried(kind[a], openness[a], v, forces.smoke, STEP[a], _part(grid, a))
+    return density * grid.cell_volume * total
+
+
+def inflow(
+    grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness: Faces, pressure: np.ndarray,
+    active: np.ndarray, weight: Weight | None,
+) -> float:  # fmt: skip
+    """Return this rank's share of the power that comes through the sides, W. Not collective.
+
+    Through jets and open sides,  sum_f q_f (p_f + rho |v|^2 / 2)  with the volume q_f that comes in a second. The
+    velocity across a face is its own, that along it the one of the cell inside. Where the pressure of the fluid at
+    rest is split off (``weight``), p is without it: this adds the potential energy of what comes and goes.
+    """
+    total = 0.0
+    for a in range(grid.dim):
+        for upper in (False, True):
+            edge = (grid.hi[a] == grid.cells[a]) if upper else (grid.lo[a] == 0)
+            if grid.periodic[a] or not edge:
+                continue
+            face, inner = list(grid.owned(a)), list(grid.owned(None))
+            plane = grid.owned(None)[a].stop if upper else grid.owned(None)[a].start
+            face[a] = slice(plane, plane + 1)
+            inner[a] = slice(plane - 1, plane) if upper else face[a]
+            at, cell = tuple(face), tuple(inner)
+            is_open, is_wall = kind[a][at] == OPEN, (kind[a][at] == WALL) & active[cell]
+            v = velocity[a][at]
+            if not np.any(is_open | (is_wall & (v != 0.0))):
+                continue
+            p = np.where(is_wall, pressure[cell], 0.0)
+            if weight is not None:
+                p = p - np.where(is_open, _rest(grid, weight, a, at), _rest(grid, weight, None, cell))
+            flow = np.where(is_open | is_wall, (-v if upper else v) * openness[a][at], 0.0) * grid.face_area(a)
+            total += float(np.sum(flow * (p + 0.5 * density * (v**2 + _along(velocity, cell, a)))))
+    return total
+
+
+def _rest(grid: MacGrid, weight: Weight, axis: int | None, part: tuple[slice, ...]) -> np.ndarray:
+    """Return the pressure of the fluid at rest on a part of the faces of an axis (None: cells)."""
+    lines = [x[s] for x, s in zip(grid.lines(axis), part, strict=True)]
+    return weight.on(list(np.meshgrid(*lines, indexing="ij", sparse=True)))
+
+
+def _along(velocity: Faces, cell: tuple[slice, ...], axis: int) -> np.ndarray:
+    """Return the squared speed of cells across an axis: means over their two faces."""
+    total = np.zeros([s.stop - s.start for s in cell])
+    for b, v in enumerate(velocity):
+        if b != axis:
+            above = tuple(slice(s.start + (c == b), s.stop + (c == b)) for c, s in enumerate(cell))
+            total += 0.5 * (v[cell] ** 2 + v[above] ** 2)
+    return total
+
+
+def _owned(grid: MacGrid, extras: Extras) -> np.ndarray:
+    """Return which links' faces are this rank's own."""
+    own = np.zeros(len(extras.axis), dtype=bool)
+    for a in range(grid.dim):
+        at = np.flatnonzero(extras.axis == a)
+        index = np.unravel_index(extras.face[at], grid.shape(a))
+        part = grid.owned(a)
+        own[at] = np.all([(i >= s.start) & (i < s.stop) for i, s in zip(index, part, strict=True)], axis=0)
+    return own
+
+
+def _part(grid: MacGrid, axis: int) -> tuple[tuple[int, int], ...]:
+    return tuple((s.start, s.stop) for s in grid.owned(axis))
+
+
+@njit(cache=True)
+def _share(kind, openness):
+    """Return the part of a whole cell's mass that a face has; split faces are not looked at."""
+    if kind == PRESSURE:
+        return openness
+    if kind == OPEN:
+        return 0.5 * openness
+    return 0.0
+
+
+@njit(cache=True)
+def _moments(kind, openness, v, part):
+    """Return the sums of v and v^2 over the owned faces of an axis, by their share of a cell."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    first = second = 0.0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                share = _share(kind[i, j, k], openness[i, j, k])
+                first += share * v[i, j, k]
+                second += share * v[i, j, k] ** 2
+    return first, second
+
+
+@njit(cache=True)
+def _carried(kind, openness, v, smoke, step, part):
+    """Return the sum of v times the smoke at the face over the owned faces of an axis."""
+    (b0, e0), (b1, e1), (b2, e2) = part
+    di, dj, dk = step
+    total = 0.0
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                mean = 0.5 * (smoke[i, j, k] + smoke[i - di, j - dj, k - dk])
+                total += _share(kind[i, j, k], openness[i, j, k]) * v[i, j, k] * mean
+    return total
