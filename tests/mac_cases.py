@@ -16,6 +16,7 @@ def make_scene(cells, gravity=None, obstacles=None, integrator="newmark", **flui
     fluid = {"origin": [0.0] * dim, "size": [1.0] * dim, "density": 1000.0, "cells": list(cells)} | fluid
     time = {"end": 1.0, "dt": 0.1, "integrator": integrator}
     scene = {"dim": dim, "time": time, "fluid": fluid, "obstacles": obstacles or {}}
+    scene["coupling"] = {"transfer": "ray"}  # obstacles of whole cells
     if gravity is not None:
         scene["gravity"] = gravity
     return Scene.model_validate(scene)

@@ -257,9 +257,10 @@ def _align(facet, of, integrals, normals, out):
         size = integrals[p].sum()
         for a in range(dim):
             side = 1 if normals[facet[p], a] < 0.0 else 0
-            if normals[facet[p], a] != 0.0:
-                for b in range(dim):
-                    total[of[p], a, side, b] += normals[facet[p], b] * size
+            # a wall along the axis faces neither side: which one round-off makes it face must not matter
+            weight = abs(normals[facet[p], a]) * size
+            for b in range(dim):
+                total[of[p], a, side, b] += normals[facet[p], b] * weight
     for k in range(len(out)):
         for a in range(dim):
             for side in range(2):

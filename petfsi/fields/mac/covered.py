@@ -1,0 +1,220 @@
+"""A grid of fluid that obstacles and solids cover in part: its cells, faces and unknowns, and the matrix over them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.errors import InputError
+from petfsi.fields.base import FluidField
+from petfsi.fields.mac import kinds, pressure
+from petfsi.fields.mac.extras import Extras
+from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.regions import Regions, find_regions
+from petfsi.fields.mac.sides import Surroundings, periodic_axes
+from petfsi.petsc import new_block, set_csr
+from petfsi.ranks import on_root
+from petfsi.scene.schema import Scene
+
+if TYPE_CHECKING:
+    from petfsi.fields.mac.cut import Walls, Wet
+    from petfsi.fields.mac.cutgrid import CutGrid, Openings
+
+
+class CoveredGrid(FluidField):
+    """A field with the pressure of every cell of a grid as unknown; which cells and faces are fluid changes with time.
+
+    Attributes
+    ----------
+    grid : MacGrid
+    density : float
+    cell_kind : ndarray of uint8
+        Cell array, see ``kinds``.
+    face_kind : list of ndarray of uint8
+        Face arrays, valid in all ghosts.
+    openness : list of ndarray
+        Face arrays: how much of a face lets fluid through, see ``cut``; 1 where nothing cuts cells.
+    index : ndarray of IntType
+        Cell array of the unknowns' global numbers.
+    extras : Extras or None
+        Further unknowns, of cells that hold several pieces of fluid.
+    volume : ndarray or None
+        Cell array: open part of each cell; None where nothing cuts cells.
+    geometry_version, kinds_version : int
+        Grow when openings change, and when kinds or unknowns do; the same on all ranks.
+    """
+
+    name = "pressure"
+
+    def __init__(self, comm: MPI.Comm, scene: Scene):
+        assert scene.fluid is not None
+        self.scene, self.comm = scene, comm
+        fluid = scene.fluid
+        periodic = periodic_axes(fluid.sides, scene.dim)
+        if any(p and n < 3 for p, n in zip(periodic, fluid.cells, strict=True)):
+            raise InputError(f"fluid.cells = {fluid.cells}: a periodic axis needs at least 3 cells")
+        self.grid = grid = MacGrid(comm, fluid.origin, fluid.size, fluid.cells, periodic)
+        self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
+        self.cell_volume, self.n_cells = grid.cell_volume, grid.layout.n_local
+        self.surroundings = Surroundings(grid, fluid.sides)
+        self._cutter = self._make_cutter() if scene.coupling.transfer == "cutcell" else None
+        if self._cutter is None:
+            for name, obstacle in scene.obstacles.items():
+                self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)
+        self._axes = range(grid.dim)
+        self.cell_kind = np.full(grid.shape(None), kinds.OUTSIDE, dtype=np.uint8)
+        self.face_kind = [grid.zeros_faces(axis, np.uint8) for axis in self._axes]
+        self.openness = [np.ones(grid.shape(axis)) for axis in self._axes]
+        self.index = grid.index
+        self.extras: Extras | None = None
+        self.volume: np.ndarray | None = None
+        self.geometry_version = self.kinds_version = 0
+        self._regions: tuple[int, Regions] | None = None
+        self.block = new_block(comm, self.layout, self.layout)
+        self.rhs = np.zeros(self.layout.n_local)
+        self._pattern = pressure.Pattern(grid)
+        self._assembled_for: tuple[int, float] | None = None
+        self._new_pattern = True
+
+    def _uncover(self) -> None:
+        """Start with what obstacles leave. Collective."""
+        if self._cutter is None:
+            self.immerse(None, None)
+        else:
+            self.cut(np.zeros((0, self.dim)), np.zeros((0, self.dim), dtype=np.int64))
+
+    def _make_cutter(self) -> CutGrid | None:
+        """Return what cuts the grid, if the scene has anything to cut it with. Collective."""
+        scene = self.scene
+        if not scene.solids and not scene.obstacles:
+            return None
+        from petfsi.fields.mac.cutgrid import CutGrid
+        from petfsi.geometry.obstacles import obstacle_surfaces
+
+        surfaces = on_root(self.comm, lambda: obstacle_surfaces(scene))
+        return CutGrid(self.grid, self.surroundings, surfaces.points, surfaces.facets, surfaces.base)
+
+    def immerse(self, inside: np.ndarray | None, crossed: list[np.ndarray] | None) -> None:
+        """Take over which cells solids cover and which faces their surfaces cut. Collective.
+
+        Parameters
+        ----------
+        inside : ndarray of uint8 or None
+            Cell array of FLUID, SOLID and VOID, valid in all ghosts.
+        crossed : list of ndarray of bool or None
+            Face arrays, valid in all ghosts.
+        """
+        grid = self.grid
+        cell_kind = kinds.merge_cells(self.surroundings.cell_kind, inside)
+        changed = not np.array_equal(cell_kind, self.cell_kind)
+        face_kind = []
+        for axis in self._axes:
+            cut = np.zeros(grid.shape(axis), dtype=bool) if crossed is None else np.asarray(crossed[axis], dtype=bool)
+            kind = np.zeros(grid.shape(axis), dtype=np.uint8)
+            kinds.classify_faces(cell_kind, self.surroundings.side_kind[axis], cut, kinds.STEP[axis], kind)
+            # of the outermost faces one cell lies beyond the ghosts
+            grid.exchange_faces(axis, kind)
+            changed = changed or not np.array_equal(kind, self.face_kind[axis])
+            face_kind.append(kind)
+        if self.comm.allreduce(changed, op=MPI.LOR):
+            self.cell_kind, self.face_kind = cell_kind, face_kind
+            self.geometry_version += 1
+            self._kinds_changed()
+
+    def cut(self, points: np.ndarray, facets: np.ndarray) -> tuple[Walls, Wet]:
+        """Take over what a surface covers of cells and faces; return what it lets through, and bears. Collective.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n, dim)
+            The same on all ranks.
+        facets : ndarray of int, shape (m, dim)
+            Segments or triangles with normals into the fluid.
+        """
+        assert self._cutter is not None
+        found = self._cutter.cut(points, facets)
+        changed = any(
+            not np.array_equal(new, old)
+            for new, old in zip([found.cell_kind, *found.face_kind], [self.cell_kind, *self.face_kind], strict=True)
+        )
+        if found.extras is not None or self.extras is not None:
+            changed = changed or found.extras is None or not found.extras.same(self.extras)
+        if self.comm.allreduce(changed, op=MPI.LOR):
+            self._renumber(found)
+            self.cell_kind, self.face_kind = found.cell_kind, found.face_kind
+            self._kinds_changed()
+        self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
+        self.geometry_version += 1
+        return found.walls, found.wet
+
+    def _renumber(self, found: Openings) -> None:
+        """Take over the unknowns of split cells; the others keep their place. Collective."""
+        self._new_pattern |= found.extras is not None or self.extras is not None
+        self.extras, self.index = found.extras, found.index
+        if found.layout != self.layout:
+            self.layout = found.layout
+            self.block = new_block(self.comm, self.layout, self.layout)
+            self.rhs = np.zeros(self.layout.n_local)
+
+    def _kinds_changed(self) -> None:
+        """Refresh what follows from the kinds. Collective."""
+        self.kinds_version += 1
+        kind_x, kind_y, kind_z = three(self.face_kind)
+        self._active = pressure.active_cells(self.cell_kind, kind_x, kind_y, kind_z, self.dim == 2)
+
+    def closed_regions(self, touched: np.ndarray | None) -> list[tuple[np.ndarray, bool]]:
+        """Return the connected regions of fluid without an OPEN face, but for single cells. Collective.
+
+        Parameters
+        ----------
+        touched : ndarray of bool or None
+            This rank's unknowns that a coupling acts on.
+
+        Returns
+        -------
+        list of (ndarray, bool)
+            Per region 1 on its unknowns and 0 elsewhere (this rank's part), and whether any of them is touched.
+        """
+        if self._regions is None or self._regions[0] != self.kinds_version:
+            linked = np.zeros_like(self._active)
+            for axis in self._axes:
+                acts = np.isin(self.face_kind[axis], (kinds.PRESSURE, kinds.OPEN, kinds.SPLIT))
+                linked |= np.delete(acts, 0, axis) | np.delete(acts, -1, axis)
+            found = find_regions(self.grid, self._active & linked, self.face_kind, self.layout, self.index, self.extras)
+            self._regions = (self.kinds_version, found)
+        regions = self._regions[1]
+        return list(zip(regions.members, regions.touching(touched), strict=True))
+
+    def volumes(self) -> np.ndarray:
+        """Return the volume of fluid that belongs to each of this rank's unknowns, m^3 (m^2 in 2D)."""
+        if self.volume is None:
+            volume = self.grid.to_vec(self._active).astype(float)
+        else:
+            volume = self.grid.to_vec(self.volume)
+        if self.extras is not None and self.volume is not None:
+            whole = self.volume.copy()
+            np.subtract.at(whole.reshape(-1), self.extras.cell, self.extras.volume)
+            volume = np.concatenate((self.grid.to_vec(whole), self.extras.volume))
+        return self.cell_volume * volume
+
+    def _assemble_block(self, factor: float) -> None:
+        """Fill L for the step's factor (see ``transport``). Collective."""
+        grid, pattern = self.grid, self._pattern
+        c = factor / self.density * grid.cell_volume / grid.dx**2
+        values = np.zeros(len(pattern.indices))
+        arrays = (*three(self.face_kind), *three(self.openness))
+        pressure.laplacian(self._active, *arrays, self._part(None), pattern.slot, c, values)
+        rows = pattern.indptr, pattern.indices, values
+        if self.extras is not None:
+            rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
+        set_csr(self.block, *rows, new_pattern=self._new_pattern)
+        self.pattern_version += self._new_pattern
+        self._new_pattern = False
+        self._assembled_for = (self.geometry_version, factor)
+        self.n_assembled += 1
+
+    def _part(self, axis: int | None) -> tuple[tuple[int, int], ...]:
+        """Return the owned ranges of faces of ``axis`` (cells: None)."""
+        return tuple((s.start, s.stop) for s in self.grid.owned(axis))
