@@ -30,6 +30,7 @@ from itertools import product
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from mpi4py import MPI
 from scipy.interpolate import CubicSpline
 
@@ -304,7 +305,7 @@ def _compare(report: Report, scene: str) -> None:
 
 
 def _picture(report: Report) -> Figure:
-    """Draw a panel for each scene; what failed everywhere is named in it."""
+    """Draw a panel for each scene; what failed everywhere is named above it."""
     figure = Figure(figsize=(12, 4.8), layout="constrained")
     scenes = list(dict.fromkeys(row["scene"] for row in report.rows))
     panels = figure.subplots(1, len(scenes), squeeze=False)[0]
@@ -319,9 +320,9 @@ def _picture(report: Report) -> Figure:
             axes.loglog([p[1] for p in best], [p[0] for p in best], line, color=f"C{n}", mfc="none", label=scheme.name)
             lost += [f"{scheme.name}: {rows[0]['why']}"] if rows and not done else []
         axes.axhline(WANTED, color="k", lw=0.6)
-        box = {"fc": "w", "ec": "none", "alpha": 0.8}
-        axes.text(0.02, 0.02, "\n".join(lost), transform=axes.transAxes, fontsize=7, va="bottom", bbox=box)
-        axes.set(xlabel="seconds of the steps", ylabel="relative error", title=scene)
+        axes.set_title("\n".join([scene, *lost]), fontsize=8)
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set(xlabel="seconds of the steps", ylabel="relative error")
         axes.grid(alpha=0.3, which="both", lw=0.4)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     return figure
