@@ -175,4 +175,4 @@ def test_without_a_name_the_benches_are_listed(capsys):
 
 def test_a_bench_that_is_not_there_is_told(capsys):
     assert cli.main(["bench", "columm"]) == 2
-    assert "columm: no such bench; there are column, splitting, stability, phases" in capsys.readouterr().err
+    assert "columm: no such bench; there are " + ", ".join(bench.BENCHES) in capsys.readouterr().err
