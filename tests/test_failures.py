@@ -159,8 +159,8 @@ SCENES = {
     "two shapes": (replaced(BLOCK, BLOCK[:-1] + ', mesh = "a.msh" }'), ["exactly one of box, ball"]),
     "a ball": (replaced(BLOCK, "{ ball = { centre = [1, 1], radius = 0.2 } }"), ["shape.ball.cells: is missing"]),
     "outside the grid": (
-        replaced("origin = [1.0, 0.0]", "origin = [2.8, 0.0]"),
-        ['solids.block.shape.box = "x from 2.8 to 3.3 m"', "x must lie inside the fluid's grid, 0 to 3 m"],
+        replaced("origin = [1.0, 0.0]", "origin = [-0.2, 0.0]"),  # the left side is not open
+        ['solids.block.shape.box = "x from -0.2 to 0.3 m"', "x must lie inside the fluid's grid, 0 to 3 m"],
     ),
     "probe": (replaced('of = "block"', 'of = "blok"'), ['probes.tip.of = "blok": must be one of fluid, block']),
     "probe far away": (

@@ -233,7 +233,7 @@ def test_a_closed_cavity_keeps_its_volume(tmp_path):
     coarse = ("--set", "fluid.cells=[48, 40]", "--set", "solids.box.shape.box.cells=[24, 24]", "--set", "output={}")
     petfsi("run", scene, "--out", tmp_path / "run", *coarse, "--steps", 20)
     history = read_history(tmp_path / "run" / "history.csv")
-    assert np.abs(history["lid.y"]).max() > 1e-3  # it does move
+    assert np.abs(history["lid.x"]).max() > 5e-3  # it does move
     assert history["volume_error"][1:].max() < 1e-9
-    # of the geometry itself: what is left is the mesh's step of first order
-    np.testing.assert_allclose(history["region_volume.1"], 0.25, rtol=1e-3)
+    # of the geometry itself: what is left is the step's error of second order
+    np.testing.assert_allclose(history["region_volume.1"], 0.25, rtol=5e-4)

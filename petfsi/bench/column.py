@@ -55,7 +55,7 @@ PERIODS = 2
 #: Rows of a history before the fit: what a multistep scheme's first step leaves behind is gone by then.
 SETTLED = 6
 #: Largest velocity at the start, m/s: the top moves by a millionth of a cell.
-SPEED = 1e-6
+SPEED = 1e-7
 ENERGY_STEPS, ENERGY_PER_PERIOD = 1000, 20
 
 ORDER_IN_MESH = {"ray": 1.0, "cutcell": 2.0}
@@ -70,7 +70,7 @@ THEORY_ERROR = 1e-4  # of the frequency at COARSE steps against theory's, which 
 DAMPING_ERROR = 5e-3  # of the damping rate against theory's
 UNDAMPED = 1e-4  # damping rate times period of a scheme that has none
 #: Round-off of the strains, some 1e-6 beside 1 in the deformation gradient, leaves 2e-8 to 5e-8 in a thousand steps.
-ENERGY_ERROR = 1e-7
+ENERGY_ERROR = 1e-8
 
 
 @dataclass(frozen=True)

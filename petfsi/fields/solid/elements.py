@@ -102,15 +102,15 @@ class Elements:
             for k in range(int(begin), int(end), CHUNK)
         ]
 
-    def deformation_gradients(self, d: np.ndarray, begin: int = 0, end: int | None = None) -> np.ndarray:
-        """Return F of elements ``begin`` to ``end``, shape (count, dim, dim); ``d`` holds all local nodes."""
+    def displacement_gradients(self, d: np.ndarray, begin: int = 0, end: int | None = None) -> np.ndarray:
+        """Return H = dd/dX of elements ``begin`` to ``end``, shape (count, dim, dim); ``d`` holds all local nodes."""
         return self._kernels.gradient(self.cells[begin:end], self.gradients[begin:end], d)
 
     def respond(self, d: np.ndarray, begin: int, end: int, body: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return energy density, stress and tangent of elements of one body."""
-        F = self.deformation_gradients(d, begin, end)
-        lame, mu = np.full(len(F), self.bodies.lame[body]), np.full(len(F), self.bodies.mu[body])
-        return self.bodies.material[body](F, lame, mu)
+        H = self.displacement_gradients(d, begin, end)
+        lame, mu = np.full(len(H), self.bodies.lame[body]), np.full(len(H), self.bodies.mu[body])
+        return self.bodies.material[body](H, lame, mu)
 
     def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
         """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective.
@@ -192,14 +192,14 @@ def _compile(dim: int) -> SimpleNamespace:
 
     @njit(cache=True)
     def gradient(cells, gradients, d):
-        F = np.empty((cells.shape[0], dim, dim))
+        H = np.empty((cells.shape[0], dim, dim))
         for e in range(cells.shape[0]):
             for i in range(dim):
                 for J in range(dim):
-                    F[e, i, J] = 1.0 if i == J else 0.0
+                    H[e, i, J] = 0.0
                     for a in range(dim + 1):
-                        F[e, i, J] += d[cells[e, a], i] * gradients[e, a, J]
-        return F
+                        H[e, i, J] += d[cells[e, a], i] * gradients[e, a, J]
+        return H
 
     @njit(cache=True)
     def scatter(cells, gradients, volume, P, C, inertia, shift, mass, A_M, A_K, node_ptr, slots, values, b):

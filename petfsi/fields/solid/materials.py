@@ -1,14 +1,14 @@
-"""Hyperelastic materials: from deformation gradients to energy, stress and tangent.
+"""Hyperelastic materials: from displacement gradients to energy, stress and tangent.
 
-A material is one function of arrays, ``material(F, lame, mu) -> W, P, C``, with
+A material is one function of arrays, ``material(H, lame, mu) -> W, P, C``, with the deformation gradient F = I + H and
 
-    F     (n, dim, dim)             deformation gradient dx/dX
+    H     (n, dim, dim)             displacement gradient dd/dX: strains far below 1 would drown in F's round-off
     lame  (n,), mu (n,)             Lame parameters, Pa
     W     (n,)                      energy density, J/m^3
     P     (n, dim, dim)             first Piola-Kirchhoff stress dW/dF, Pa
     C     (n, dim, dim, dim, dim)   tangent, C[i, J, k, L] = dP[i, J] / dF[k, L], Pa
 
-It is given a few hundred deformation gradients at a time. In 2D strain is plane: F has no third direction.
+It is given a few hundred gradients at a time. In 2D strain is plane: F has no third direction.
 """
 
 from __future__ import annotations
@@ -26,43 +26,46 @@ def lame_parameters(young: float, poisson: float) -> tuple[float, float]:
     return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
 
 
-def green(F: np.ndarray, lame: np.ndarray, mu: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def green(H: np.ndarray, lame: np.ndarray, mu: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return energy, stress and exact tangent of the St Venant-Kirchhoff material.
 
     Green's strain with a linear isotropic stress:
 
-        E = (F^T F - I) / 2,    S = lambda tr(E) I + 2 mu E,    W = S : E / 2,    P = F S,
+        E = (H + H^T + H^T H) / 2,    S = lambda tr(E) I + 2 mu E,    W = S : E / 2,    P = F S,
         C[i,J,k,L] = d_ik S_JL + lambda F_iJ F_kL + mu ((F F^T)_ik d_JL + F_iL F_kJ).
 
     References
     ----------
     J. F. O'Brien, J. K. Hodgins, Graphical modeling and animation of brittle fracture (1999), section 3.
     """
-    return (_green_2d if F.shape[1] == 2 else _green_3d)(F, lame, mu)
+    return (_green_2d if H.shape[1] == 2 else _green_3d)(H, lame, mu)
 
 
 def _compile_green(dim: int) -> Material:
     # dim as a constant of the closure lets the compiler unroll the loops over axes
 
     @njit(cache=True, error_model="numpy")
-    def kernel(F, lame, mu):
-        n = F.shape[0]
+    def kernel(H, lame, mu):
+        n = H.shape[0]
         W = np.empty(n)
         P = np.empty((n, dim, dim))
         C = np.empty((n, dim, dim, dim, dim))
         S = np.empty((dim, dim))
         B = np.empty((dim, dim))
+        F = np.empty((dim, dim))
         for e in range(n):
+            for i in range(dim):
+                for j in range(dim):
+                    F[i, j] = H[e, i, j] + (1.0 if i == j else 0.0)
             trace = 0.0
             for i in range(dim):
                 for j in range(dim):
-                    strain = 0.0
+                    strain = H[e, i, j] + H[e, j, i]
                     B[i, j] = 0.0
                     for k in range(dim):
-                        strain += F[e, k, i] * F[e, k, j]
-                        B[i, j] += F[e, i, k] * F[e, j, k]
+                        strain += H[e, k, i] * H[e, k, j]
+                        B[i, j] += F[i, k] * F[j, k]
                     if i == j:
-                        strain -= 1.0
                         trace += 0.5 * strain
                     S[i, j] = mu[e] * strain
             W[e] = 0.5 * lame[e] * trace * trace
@@ -75,9 +78,9 @@ def _compile_green(dim: int) -> Material:
                 for J in range(dim):
                     P[e, i, J] = 0.0
                     for k in range(dim):
-                        P[e, i, J] += F[e, i, k] * S[k, J]
+                        P[e, i, J] += F[i, k] * S[k, J]
                         for L in range(dim):
-                            c = lame[e] * F[e, i, J] * F[e, k, L] + mu[e] * F[e, i, L] * F[e, k, J]
+                            c = lame[e] * F[i, J] * F[k, L] + mu[e] * F[i, L] * F[k, J]
                             if i == k:
                                 c += S[J, L]
                             if J == L:

@@ -302,14 +302,19 @@ class SimplexSolid(SolidField):
         self.comm.Allreduce(np.array(self._elements.energies(d, u, self._mesh.counted)), total)
         return {"kinetic": float(total[0]), "elastic": float(total[1])}
 
+    def _volume_ratios(self) -> np.ndarray:
+        """Return det F of this rank's elements. Collective."""
+        H = self._elements.displacement_gradients(self._with_shared(self.displacement))
+        return np.linalg.det(np.eye(self.dim) + H)
+
     def quality(self) -> float:
         """Return the smallest det F: 1 at rest, 0 or less where an element is inverted. Collective."""
-        J = np.linalg.det(self._elements.deformation_gradients(self._with_shared(self.displacement)))
+        J = self._volume_ratios()
         return self.comm.allreduce(float(J.min(initial=np.inf)), MPI.MIN)
 
     def volumes(self) -> dict[str, float]:
         """Return the present volume of each body, m^3 (m^2 in 2D). Collective."""
-        J = np.linalg.det(self._elements.deformation_gradients(self._with_shared(self.displacement)))
+        J = self._volume_ratios()
         own = np.where(self._mesh.counted, J * self._elements.volume, 0.0)
         total = np.empty(len(self.names))
         self.comm.Allreduce(np.bincount(self._mesh.body, weights=own, minlength=len(self.names)), total)
