@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
+from petfsi.couplings.blocks import TransferBlocks
 from petfsi.fields.base import SolidField, Work
-from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
+from petfsi.petsc import IntType, gather_triplets
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
@@ -41,21 +41,15 @@ class CutCellCoupling(Coupling):
         self._free_map = self.surface.point_map[:, self._free]
         self._new_blocks()
         self._positions: np.ndarray | None = None
-        self._patterns: list[tuple[np.ndarray, ...]] = []
         self._stale, self._dt = False, 0.0
         self._held = np.zeros(self.surface.point_map.shape[0])
         self._held_outflow = np.zeros(0)
 
     def _new_blocks(self) -> None:
-        fluid, solid = self.fluid, self.solid
-        self.layout = fluid.layout
-        self.flux_block = new_block(self.comm, fluid.layout, solid.layout)
-        self.force_block = new_block(self.comm, solid.layout, fluid.layout)
-        self.blocks: dict[tuple[str, str], PETSc.Mat] = {
-            (fluid.name, solid.name): self.flux_block,
-            (solid.name, fluid.name): self.force_block,
-        }
-        self._patterns = []
+        self.layout = self.fluid.layout
+        self._transfer = TransferBlocks(self.comm, self.fluid, self.solid)
+        self.flux_block, self.force_block = self._transfer.flux, self._transfer.force
+        self.blocks = self._transfer.by_name
 
     def couple(self, time: float, dt: float) -> None:
         """Cut the grid and make J; nothing if no point moved."""
@@ -102,7 +96,8 @@ class CutCellCoupling(Coupling):
             self._new_blocks()
         # whoever solves may scale the blocks in place, by amounts that depend on dt
         if self._stale or dt != self._dt:
-            self._fill()
+            self.pattern_version += self._transfer.fill(*self._rows)
+            self.n_assembled += 1
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
             self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
@@ -110,19 +105,6 @@ class CutCellCoupling(Coupling):
             self.fluid.rhs -= self._held_outflow
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
-
-    def _fill(self) -> None:
-        patterns: list[tuple[np.ndarray, ...]] = [rows[:2] for rows in self._rows]
-        new = 0
-        for bit, pattern in enumerate(patterns):
-            if not self._patterns or not all(map(np.array_equal, pattern, self._patterns[bit])):
-                new |= 1 << bit
-        new = self.comm.allreduce(new, op=MPI.BOR)
-        for bit, block in enumerate((self.flux_block, self.force_block)):
-            set_csr(block, *self._rows[bit], new_pattern=bool(new >> bit & 1))
-        self._patterns = patterns
-        self.pattern_version += new > 0
-        self.n_assembled += 1
 
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return the work of the fluid's weight on all points, and what supports do against it and the pressure."""

@@ -7,23 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
+from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.kinds import FLUID, SOLID, SOLID_FACE, VOID
 from petfsi.geometry import rays
-from petfsi.petsc import IntType, gather_triplets, new_block, set_csr
+from petfsi.petsc import IntType, gather_triplets
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.fluid import MacFluid
-
-
-#: This rank's rows of a matrix: indptr, global columns, values.
-Rows = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class RayCoupling(Coupling):
@@ -58,17 +54,13 @@ class RayCoupling(Coupling):
         # the surface's own unknowns alone, so that no product runs over all of the solid's
         self._free = np.unique(self.surface.point_map.indices)
         self._free_map = self.surface.point_map[:, self._free]
-        self.flux_block = new_block(self.comm, fluid.layout, solid.layout)
-        self.force_block = new_block(self.comm, solid.layout, fluid.layout)
-        self.blocks: dict[tuple[str, str], PETSc.Mat] = {
-            (fluid.name, solid.name): self.flux_block,
-            (solid.name, fluid.name): self.force_block,
-        }
+        self._transfer = TransferBlocks(self.comm, fluid, solid)
+        self.flux_block, self.force_block = self._transfer.flux, self._transfer.force
+        self.blocks = self._transfer.by_name
         self.touched_cells: np.ndarray = self.grid.zeros_cells(dtype=bool)
         self._positions: np.ndarray | None = None
         self._faces: list[rays.Hits] = []
         self._rows: list[Rows] = []
-        self._patterns: list[tuple[np.ndarray, ...]] = []
         self._stale, self._dt = False, 0.0
         self._held_outflow = np.zeros(0)
 
@@ -219,16 +211,7 @@ class RayCoupling(Coupling):
         """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
         # whoever solves may scale the blocks in place, by amounts that depend on dt
         if self._stale or dt != self._dt:
-            patterns: list[tuple[np.ndarray, ...]] = [rows[:2] for rows in self._rows]
-            new = 0
-            for bit, pattern in enumerate(patterns):
-                if not self._patterns or not all(map(np.array_equal, pattern, self._patterns[bit])):
-                    new |= 1 << bit
-            new = self.comm.allreduce(new, op=MPI.BOR)
-            for bit, block in enumerate((self.flux_block, self.force_block)):
-                set_csr(block, *self._rows[bit], new_pattern=bool(new >> bit & 1))
-            self._patterns = patterns
-            self.pattern_version += new > 0
+            self.pattern_version += self._transfer.fill(*self._rows)
             self.n_assembled += 1
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
