@@ -173,3 +173,15 @@ def test_any_number_of_ranks_gives_the_serial_answer(name):
             states.append(sim.solid.probe("body", [0.5, 0.45, 0.45][:dim], "velocity"))
     assert states[0] == pytest.approx(states[1], rel=1e-8)
     assert abs(states[1][1]) > 1e-3
+
+
+def test_water_rests_on_both_sides_of_a_sheet_through_an_open_side():
+    solid = {"shape": box([0.487, 0.0], [0.1 / 16, 1.0], [1, 4]), "supports": held(2)}
+    scene = make_scene(2, [16, 16], [1.0, 1.0], solid, {"top": "open"}, [0.0, -G])
+    with simulation(MPI.COMM_SELF, scene, DIRECT) as sim:
+        for _ in range(3):
+            sim.advance()
+        assert sim.fluid.extras is not None
+        assert all(np.abs(v).max() < 1e-10 for v in sim.fluid.velocity)
+        pressures = [sim.fluid.probe("pressure", [x, 0.5]) for x in (0.2, 0.8)]
+        assert pressures == pytest.approx([RHO * G * 0.5] * 2, rel=1e-9)

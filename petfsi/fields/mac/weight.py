@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from petfsi.fields.mac.grid import MacGrid
-from petfsi.fields.mac.kinds import OPEN
+from petfsi.fields.mac.kinds import OPEN, SPLIT
 from petfsi.scene.expressions import Expression
 
 
@@ -67,4 +67,4 @@ class Weight:
                 lines = [x[s] for x, s in zip(grid.lines(a), part, strict=True)]
                 p = -self.on(list(np.meshgrid(*lines, indexing="ij", sparse=True)))
                 push = (-2.0 if upper else 2.0) * duration / (self.density * grid.dx[a])
-                star[a][part] += np.where(face_kind[a][part] == OPEN, push * p, 0.0)
+                star[a][part] += np.where(np.isin(face_kind[a][part], (OPEN, SPLIT)), push * p, 0.0)
