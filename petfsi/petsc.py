@@ -73,6 +73,11 @@ def set_csr(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, values: np.
         mat.assemble()
 
 
+def collect_garbage() -> None:
+    """Free what Python has let go of: PETSc only notes it, and frees it when all ranks come here. Collective."""
+    PETSc.garbage_cleanup()
+
+
 def add_to_composite(composite: PETSc.Mat, part: PETSc.Mat) -> None:
     """Add a matrix to the sum that a matrix of type composite stands for; petsc4py has no word for it. Collective."""
     add = _library().MatCompositeAddMat

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build
+from petfsi import build, petsc
 from petfsi.accounts import Accounts
 from petfsi.errors import SolveError
 from petfsi.fields.base import FluidField, Reader, Slab, SolidField
@@ -93,6 +93,7 @@ class Simulation:
             self.outcome = self.solver.solve(changed)
         with self.phase("accept"):
             self._accept(t, dt)
+            petsc.collect_garbage()
         self.step += 1
         self.time = self._stepping.after(self.step, t, dt)
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,8 +13,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from mpi4py import MPI
 from processes import environment, launcher
 
+from petfsi.bench.case import job, simulation
 from petfsi.output.history import read_history
 from petfsi.solve import shipped_options
 
@@ -237,3 +240,18 @@ def test_a_closed_cavity_keeps_its_volume(tmp_path):
     assert history["volume_error"][1:].max() < 1e-9
     # of the geometry itself: what is left is the step's error of second order
     np.testing.assert_allclose(history["region_volume.1"], 0.25, rtol=5e-4)
+
+
+def test_memory_does_not_grow_with_the_steps():
+    def used():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    scene = job(MPI.COMM_SELF, "cavity", {"fluid.cells": [24, 20], "solids.box.shape.box.cells": [12, 12]})
+    with simulation(MPI.COMM_SELF, scene, "monolithic.opts") as sim:
+        for _ in range(50):
+            sim.advance()
+        before = used()
+        for _ in range(150):
+            sim.advance()
+    # what a step makes and drops is about 50 kB here
+    assert used() - before < 2e6
