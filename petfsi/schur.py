@@ -18,7 +18,6 @@ from petfsi import petsc
 from petfsi.petsc import IntType, Layout, new_block, set_csr
 from petfsi.system import System
 
-
 #: X times the diagonal of A.
 SOFTER = 3.0
 #: Largest E_ii / L_ii up to which E is left out.
