@@ -19,8 +19,10 @@ from petfsi.system import System
 
 #: Bodies lighter than this part of the fluid have modes.
 LIGHT = 0.05
+#: Where no body is that light, those lighter than this part of the fluid have linear ones: a stiff body moves so.
+LINEAR = 0.3
 #: Degree of the polynomials.
-DEGREE = 2
+DEGREE = 3
 #: Motions of all bodies together; more bodies have simpler ones, or none.
 MOST = 60
 
@@ -70,7 +72,11 @@ class Modes:
         self._w = np.ascontiguousarray(w[:, self._rows])
         total = self._comm.allreduce(np.array([stiff, self._w @ self._answers[:, self._rows].T]))
         total = 0.5 * (total + total.swapaxes(1, 2))
-        self._capacity = np.linalg.pinv(total.sum(axis=0), rcond=1e-13, hermitian=True)
+        whole = total.sum(axis=0)
+        size = np.sqrt(whole.diagonal())
+        size[size == 0] = 1.0
+        self._capacity = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-13, hermitian=True)
+        self._capacity /= np.outer(size, size)
         for vec in (motion, resisted, pushed, answer):
             vec.destroy()
 

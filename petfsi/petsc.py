@@ -78,14 +78,6 @@ def collect_garbage() -> None:
     PETSc.garbage_cleanup()
 
 
-def add_to_composite(composite: PETSc.Mat, part: PETSc.Mat) -> None:
-    """Add a matrix to the sum that a matrix of type composite stands for; petsc4py has no word for it. Collective."""
-    add = _library().MatCompositeAddMat
-    add.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
-    if add(composite.handle, part.handle):
-        raise PETSc.Error
-
-
 def set_mg_residual(pc: PETSc.PC, level: int, operator: PETSc.Mat) -> None:
     """Give a level of PCMG the matrix of its residuals: it keeps that of its first set-up else. Collective."""
     function = _library().PCMGSetResidual

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from petfsi.errors import InputError
 from petfsi.fields.base import FluidField, SolidField
-from petfsi.modes import DEGREE, LIGHT, MOST, Modes
+from petfsi.modes import DEGREE, LIGHT, LINEAR, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
 from petfsi.schur import FAINT, SchurStandIn
 from petfsi.system import System
@@ -48,10 +48,7 @@ class PressureSolver:
         self.eliminates = bool(system.index_sets) and options.getString("pc_fieldsplit_type", "") == "schur"
         if self.eliminates and options.getString("pc_fieldsplit_schur_precondition", "a11") == "user":
             own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
-            grids = own.getString("pc_type", "") == PETSc.PC.Type.MG
-            sums = grids and own.getString("pc_mg_galerkin", "none") == "none"
-            assembled, faint = own.getBool("schur_assembled", True), own.getReal("schur_faint", FAINT)
-            self.stand_in = SchurStandIn(system, assembled, faint)
+            self.stand_in = SchurStandIn(system, own.getReal("schur_faint", FAINT))
             outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
 
     def connect(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
@@ -79,20 +76,23 @@ class PressureSolver:
         """Read petfsi's own options, whether this scene needs them or not, so that none goes unread."""
         self._change, self._growth = own.getReal("lag_change", CHANGE), own.getReal("lag_growth", GROWTH)
         self._degree, self._light = own.getInt("modes_degree", DEGREE), own.getReal("modes_below", LIGHT)
+        self._rigid = own.getReal("modes_linear_below", LINEAR)
         self._aims = not own.hasName("ksp_atol")
-        own.getBool("schur_assembled", False)
         own.getReal("schur_faint", FAINT)
 
     def _add_modes(self, ksp: PETSc.KSP) -> None:
         """Wrap the preconditioner if there are light bodies. Collective."""
-        degree, light = self._degree, self._light * self.fluid.density
         solid = self.system.fields[0]
         assert isinstance(solid, SolidField)
-        if degree < 0 or not len(solid.light_motions(degree, light, MOST)):
+        for degree, part in ((self._degree, self._light), (min(self._degree, 1), self._rigid)):
+            density = part * self.fluid.density
+            if degree >= 0 and len(solid.light_motions(degree, density, MOST)):
+                break
+        else:
             return
         wrapped = PETSc.PC().create(self.system.comm)
         wrapped.setType(PETSc.PC.Type.PYTHON)
-        wrapped.setPythonContext(Modes(ksp.getPC(), self.system, degree, light))
+        wrapped.setPythonContext(Modes(ksp.getPC(), self.system, degree, density))
         wrapped.setOperators(*ksp.getOperators())
         ksp.setPC(wrapped)
         self._has_modes = True

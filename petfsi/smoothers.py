@@ -11,9 +11,11 @@ then smooths nothing. There the rows that walls touch are solved together, the o
     M = [ (L + E)_ww      0      ]        w: unknowns with walls.
         [      0      diag(L)_oo ]
 
-No eigenvalue of M^-1 (L + E) exceeds 2 either.
+No eigenvalue of M^-1 (L + E) exceeds 2 either. Those of what E alone resists are all 1: damped to a root of
+Chebyshev's polynomial, they are not reduced but gone, which a coarse grid that knows little of E needs.
 
     -..._mg_levels_walls_from 10      largest E_ii / L_ii from which on the block is solved; 0 is always
+    -..._mg_levels_walls_damping .634 of the block; the lower root for two iterations between 0.4 and 2
     -..._mg_levels_walls_pc_type      how; redundant Cholesky unless told otherwise
 """
 
@@ -25,6 +27,8 @@ from petsc4py import PETSc
 
 #: Largest E_ii / L_ii up to which the diagonal is good enough.
 DOMINANT = 10.0
+#: The lower root of Chebyshev's polynomial of degree 2 on [0.4, 2].
+DAMPING = 1.2 - 0.8 * np.sqrt(0.5)
 
 
 class Walls:
@@ -44,7 +48,8 @@ class Walls:
     def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
         """Take up the operator's present values. Collective."""
         self._prefix = f"{pc.getOptionsPrefix()}walls_"
-        self._dominant = PETSc.Options(self._prefix).getReal("from", DOMINANT)
+        own = PETSc.Options(self._prefix)
+        self._dominant, self._damping = own.getReal("from", DOMINANT), own.getReal("damping", DAMPING)
         self._drop()
         fluxes, walls = self.parts
         diagonal = _bound(fluxes if fluxes is not None else pc.getOperators()[1])
@@ -91,7 +96,7 @@ class Walls:
         if self._ksp is not None:
             self._b.array[:] = x.array_r[self._rows]
             self._ksp.solve(self._b, self._x)
-            y.array[self._rows] = self._x.array_r
+            y.array[self._rows] = self._damping * self._x.array_r
 
 
 def _bound(mat: PETSc.Mat) -> PETSc.Vec:

@@ -199,6 +199,12 @@ class Solver:
         pc = ksp.getPC()
         return list(pc.getFieldSplitSubKSP()) if pc.getType() == PETSc.PC.Type.FIELDSPLIT else []
 
+    def solver_of(self, name: str) -> PETSc.KSP | None:
+        """Return a field's own solver inside that of the whole, or None if nothing is split or set up."""
+        names = [field.name for field in self.system.fields]
+        subs = self._sub_solvers(self._ksp) if self._ksp is not None else []
+        return subs[names.index(name)] if subs and name in names else None
+
     def reset(self) -> None:
         """Forget everything but the options, so that the next solve is that of a fresh process. Collective."""
         if self._ksp is not None:

@@ -132,6 +132,18 @@ def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, r
     assert 0.3 <= history["time"][-1] < 0.3 + history["dt"][-1] and np.ptp(history["dt"][1:]) > 0.005
 
 
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_divided_cells_go_on_bit_for_bit(ranks, tmp_path):
+    for name, steps in (("straight", ()), ("stopped", ("--steps", 9))):
+        petfsi("run", SCENES / "sheet.toml", "--out", tmp_path / name, *steps, ranks=ranks)
+    petfsi("resume", tmp_path / "stopped", ranks=ranks)
+    want, got = last_output(tmp_path / "straight"), last_output(tmp_path / "stopped")
+    assert want.keys() == got.keys()
+    assert not [name for name in want if not np.array_equal(want[name], got[name])]
+    histories = [(tmp_path / name / "history.csv").read_bytes() for name in ("straight", "stopped")]
+    assert histories[0] == histories[1]
+
+
 def test_a_step_that_is_not_positive_ends_the_run_with_its_time(tmp_path):
     done = subprocess.run(
         command("run", SCENES / "beam.toml", "--out", tmp_path / "run", "--set", "time.dt='0.02 - t/4'"),

@@ -1,7 +1,8 @@
 """What a monolithic step costs beside a split one, phase by phase, on the bar in a jet.
 
 Both simulations advance in turn, a step each, so that whatever else the machine does meets both. Published ratio of a
-step's seconds: 1.37 (Chentanez et al. 2006).
+step's seconds: 1.37 (Chentanez et al. 2006). Both stop at the same residual: the split scheme's pressure, whose
+tolerance is relative to what the solid's velocity leaves of the right-hand side, is given that of the whole.
 """
 
 from __future__ import annotations
@@ -11,14 +12,17 @@ from matplotlib.figure import Figure
 
 from petfsi.bench.case import MONOLITHIC, SPLIT, Case, job, only_options
 from petfsi.bench.report import Report, Row
+from petfsi.pressure_solver import SHARE
 from petfsi.simulation import PHASES, Simulation
 
 SCHEMES = (MONOLITHIC, SPLIT)
 WARM_UP, STEPS = 2, 12
 #: Heavy enough for splitting to be stable: a scheme that blows up has no cost.
-SETS = {"solids.bar.density": 100.0, "time.dt": 1 / 120}
+SETS = {"solids.bar.density": 100.0, "time.dt": 1 / 120, "coupling": {"transfer": "cutcell"}}
 QUICK = {"fluid.cells": [32, 24, 24], "solids.bar.shape.box.cells": [2, 18, 5]}
 PUBLISHED_RATIO = 1.37
+#: Of monolithic.opts.
+TOLERANCE = 1e-9
 
 
 def run(case: Case) -> Report:
@@ -57,11 +61,20 @@ def _measure(case: Case) -> tuple[dict[str, np.ndarray], dict[str, float]]:
             sim = running[scheme]
             before = np.array([sim.phases[name] for name in PHASES[:-1]])
             with only_options(["-options_file", scheme]):
+                if scheme == SPLIT:
+                    _aim(sim)
                 sim.advance()
             seconds[scheme].append(list(np.array([sim.phases[name] for name in PHASES[:-1]]) - before))
             iterations[scheme].append(sim.outcome.iterations)
     slowest = {scheme: np.max(case.comm.allgather(seconds[scheme]), axis=0)[WARM_UP:] for scheme in SCHEMES}
     return slowest, {scheme: float(np.mean(iterations[scheme][WARM_UP:])) for scheme in SCHEMES}
+
+
+def _aim(sim: Simulation) -> None:
+    """Have the split scheme's pressure stop where the monolithic one does, by the last right-hand side. Collective."""
+    solver = sim.solver.solver_of("pressure")
+    assert solver is not None
+    solver.setTolerances(rtol=1e-14, atol=SHARE * TOLERANCE * sim.system.rhs.norm())
 
 
 def _picture(report: Report, names: list[str]) -> Figure:
