@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from petfsi import petsc
 from petfsi.bench.case import MONOLITHIC, SPLIT, Case, job, only_options
 from petfsi.bench.report import Report, Row
 from petfsi.errors import SolveError
@@ -133,6 +134,8 @@ def solves(case: Case, contestants: list[tuple[Scene, str]], repeats: int) -> li
                     row["factorisation"] = _factorisation(case, sim)
     for sim, _ in ready:
         sim.solver.reset()
+    del ready, sim
+    petsc.collect_garbage()  # or the next case's matrices come on top
     return rows
 
 
