@@ -9,7 +9,8 @@ from numba import njit
 
 from petfsi.geometry.links import Split, link_pieces
 from petfsi.geometry.patches import Patches
-from petfsi.geometry.walks import NOTHING, find, join, position_of, walk_2d
+from petfsi.geometry.union_find import find, join
+from petfsi.geometry.walks import NOTHING, position_of, walk_2d
 from petfsi.geometry.walks_3d import walk_3d
 
 #: A cell is only split if its pieces close, and fill its faces, to this fraction; solids that overlap do not.

@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 
 from petfsi.geometry.slabs import MOST, PLANE, clip_to_cell
+from petfsi.geometry.union_find import join
 
 #: Volumes and faces (fractions) that may be left out.
 NOTHING = 1e-13
@@ -41,22 +42,6 @@ class Lines(NamedTuple):
     position: np.ndarray
     node: np.ndarray
     length: np.ndarray
-
-
-@njit(cache=True)
-def find(parent, i):
-    """Return the root of a node."""
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@njit(cache=True)
-def join(parent, i, j):
-    """Make two nodes one piece; the lower root stays."""
-    i, j = find(parent, i), find(parent, j)
-    parent[max(i, j)] = min(i, j)
 
 
 @njit(cache=True)

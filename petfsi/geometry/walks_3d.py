@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from petfsi.geometry.slabs import MOST, PLANE, clip_to_cell
-from petfsi.geometry.walks import find_lines, hit, join, line_of, stretch
+from petfsi.geometry.union_find import join
+from petfsi.geometry.walks import find_lines, hit, line_of, stretch
 
 
 class Traces(NamedTuple):

@@ -41,12 +41,6 @@ class MacFluid(CoveredGrid):
         Cell array, Pa; zero where it is not solved.
     smoke : ndarray or None
         Cell array.
-    cell_kind : ndarray of uint8
-        Cell array, see ``kinds``.
-    face_kind : list of ndarray of uint8
-        Face arrays, valid in all ghosts.
-    geometry_version : int
-        Grows when any kind changes on any rank.
     """
 
     name = "pressure"

@@ -12,25 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.kinds import OPEN, PRESSURE
+from petfsi.geometry.union_find import find, join
 from petfsi.petsc import Layout
-
-
-@njit(cache=True)
-def _root(parent, a):
-    while parent[a] != a:
-        parent[a] = parent[parent[a]]
-        a = parent[a]
-    return a
-
-
-@njit(cache=True)
-def _join(parent, a, b):
-    a, b = _root(parent, a), _root(parent, b)
-    # the smaller number is the root, so that the first cell met stands for its region
-    if a < b:
-        parent[b] = a
-    else:
-        parent[a] = b
 
 
 @njit(cache=True)
@@ -44,11 +27,11 @@ def _label(active, kind0, kind1, kind2, part, flat, labels):
             for k in range(b2, e2):
                 c = ((i - b0) * m1 + j - b1) * m2 + k - b2
                 if i > b0 and kind0[i, j, k] == PRESSURE:
-                    _join(parent, c, c - m1 * m2)
+                    join(parent, c, c - m1 * m2)
                 if j > b1 and kind1[i, j, k] == PRESSURE:
-                    _join(parent, c, c - m2)
+                    join(parent, c, c - m2)
                 if not flat and k > b2 and kind2[i, j, k] == PRESSURE:
-                    _join(parent, c, c - 1)
+                    join(parent, c, c - 1)
     number = np.full(len(parent), -1)
     first = np.empty(len(parent), np.int64)
     count = 0
@@ -58,7 +41,7 @@ def _label(active, kind0, kind1, kind2, part, flat, labels):
                 if not active[i, j, k]:
                     continue
                 c = ((i - b0) * m1 + j - b1) * m2 + k - b2
-                root = _root(parent, c)
+                root = find(parent, c)
                 if number[root] < 0:
                     number[root] = count
                     first[count] = c
