@@ -1,10 +1,13 @@
 """The cut-cell transfer: identities to round-off, exact forces, and the same answer on any number of ranks."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from petfsi.bench.case import simulation
+from petfsi.scene.load import load_scene
 from petfsi.scene.schema import Scene
 
 DIRECT = "monolithic-direct.opts"
@@ -185,3 +188,15 @@ def test_water_rests_on_both_sides_of_a_sheet_through_an_open_side():
         assert all(np.abs(v).max() < 1e-10 for v in sim.fluid.velocity)
         pressures = [sim.fluid.probe("pressure", [x, 0.5]) for x in (0.2, 0.8)]
         assert pressures == pytest.approx([RHO * G * 0.5] * 2, rel=1e-9)
+
+
+@pytest.mark.parallel([2, 4])
+def test_a_divided_cell_may_go_from_one_rank_to_another():
+    scene = load_scene(Path(__file__).parent / "scenes" / "bar2d.toml", ["time.integrator=bdf2"])
+    tips = []
+    for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+        with simulation(comm, scene, "monolithic.opts") as sim:
+            for _ in range(20):
+                sim.advance()
+            tips.append(sim.probe()[0])
+    assert tips[0] == pytest.approx(tips[1], rel=1e-8)

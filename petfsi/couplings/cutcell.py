@@ -46,7 +46,7 @@ class CutCellCoupling(Coupling):
         self._held_outflow = np.zeros(0)
 
     def _new_blocks(self) -> None:
-        self.layout = self.fluid.layout
+        self._made_for = self.fluid.block
         self._transfer = TransferBlocks(self.comm, self.fluid, self.solid)
         self.flux_block, self.force_block = self._transfer.flux, self._transfer.force
         self.blocks = self._transfer.by_name
@@ -92,7 +92,7 @@ class CutCellCoupling(Coupling):
 
     def assemble(self, time: float, dt: float) -> None:
         """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
-        if self.layout != self.fluid.layout:
+        if self._made_for is not self.fluid.block:  # its unknowns have changed, on all ranks
             self._new_blocks()
         # whoever solves may scale the blocks in place, by amounts that depend on dt
         if self._stale or dt != self._dt:

@@ -153,7 +153,8 @@ class CoveredGrid(FluidField):
         """Take over the unknowns of split cells; the others keep their place. Collective."""
         self._new_pattern |= found.extras is not None or self.extras is not None
         self.extras, self.index = found.extras, found.index
-        if found.layout != self.layout:
+        # an unknown that goes from one rank to another changes nothing on a third, which must take part
+        if self.comm.allreduce(found.layout != self.layout, op=MPI.LOR):
             self.layout = found.layout
             self.block = new_block(self.comm, self.layout, self.layout)
             self.rhs = np.zeros(self.layout.n_local)
