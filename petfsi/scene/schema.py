@@ -251,6 +251,10 @@ class Solid(Table):
     young: Annotated[Real, Field(gt=0, description="Pa")]
     poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
     material: Literal["green"] = "green"
+    elements: Annotated[Literal["linear", "quadratic"], Field(description="order of the shape functions")] = "linear"
+    volumetric: Annotated[
+        Literal["full", "reduced"], Field(description="integration of lambda's part; reduced does not lock")
+    ] = "full"
     mass: Literal["consistent", "lumped"] = "consistent"
     interior: Literal["fluid", "void"] = "fluid"
     damping: Damping = Damping()
