@@ -250,7 +250,7 @@ class Solid(Table):
     density: Annotated[Real, Field(gt=0, description="kg/m^3")]
     young: Annotated[Real, Field(gt=0, description="Pa")]
     poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
-    material: Literal["green"] = "green"
+    material: Literal["green", "linear", "neohookean", "stable-neohookean"] = "green"
     elements: Annotated[Literal["linear", "quadratic"], Field(description="order of the shape functions")] = "linear"
     volumetric: Annotated[
         Literal["full", "reduced"], Field(description="integration of lambda's part; reduced does not lock")

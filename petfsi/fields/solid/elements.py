@@ -200,9 +200,10 @@ class Elements:
         _, P, C = batch.respond(at.displacement, part, tangent)
         if shifted:
             loops.contract(C, batch.gradients(at.shift, part), P)
-        loops.forces(cells, batch.basis[part], batch.rule.table, batch.weights[part], P, b)
-        if not batch.is_patch:
-            loops.inertia(cells, batch.volume[part], batch.mass, at.inertia, b)
+        loops.forces(
+            cells, batch.basis[part], batch.rule.table, batch.weights[part], P,
+            batch.volume[part], batch.mass, at.inertia, b,
+        )  # fmt: skip
         return C
 
     # ---- masses -----------------------------------------------------------------------------------------------

@@ -17,14 +17,14 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
 
         gradient(cells, basis, table, d, H)         H = sum_a d_a g_a^T at every point
         contract(C, S, T)                           T += C : S at every point
-        forces(cells, basis, table, w, T, b)        b_a -= w T g_a in the first rows of ``b``
-        inertia(cells, mass, V, b)                  b_a += mass_ab V_b
-        tangent(cells, basis, table, w, C, mass, A_M, A_K, node_ptr, slots, values)
-                                                    A_M mass_ab I + A_K w g_a . C . g_b, into the rows' values
+        forces(cells, basis, table, w, T, volume, mass, V, b)
+                                                    b_a += volume mass_ab V_b - w T g_a in the first rows of b
+        kinetic(cells, volume, mass, u, v)          returns the sum of volume mass_ab u_a . v_b
+        tangent(cells, basis, table, w, C, volume, mass, A_M, A_K, node_ptr, slots, values)
+                                                    A_M volume mass_ab I + A_K w g_a . C . g_b, into the rows' values
         matrices(cells, basis, table, w, C, K)      K = w g_a . C . g_b of each element
 
-    Points lie element after element, (ne * Q, dim, dim); ``w`` has shape (ne, Q) and ``mass`` is an element's volume
-    times a table.
+    Points lie element after element, (ne * Q, dim, dim); ``w`` has shape (ne, Q).
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
     # the same form for all, so that one function makes g
     n_basis = nodes if plain else dim + 1
 
-    @njit(cache=True)
+    @njit(inline="always")
     def shape_gradients(basis, table, g):
         for a in range(nodes):
             for J in range(dim):
@@ -74,32 +74,29 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                     T[p, i, J] += s
 
     @njit(cache=True)
-    def forces(cells, basis, table, w, T, b):
+    def forces(cells, basis, table, w, T, volume, mass, V, b):
         n_points = table.shape[0]
-        g = np.empty((nodes, dim))
+        g, f = np.empty((nodes, dim)), np.empty((nodes, dim))
         for e in range(cells.shape[0]):
+            for a in range(nodes):
+                for i in range(dim):
+                    f[a, i] = 0.0
+                for m in range(nodes):
+                    for i in range(dim):
+                        f[a, i] += volume[e] * mass[a, m] * V[cells[e, m], i]
             for q in range(n_points):
                 shape_gradients(basis[e], table[q], g)
                 for a in range(nodes):
-                    row = cells[e, a]
-                    if row < b.shape[0]:
-                        for i in range(dim):
-                            s = 0.0
-                            for J in range(dim):
-                                s += T[e * n_points + q, i, J] * g[a, J]
-                            b[row, i] -= w[e, q] * s
-
-    @njit(cache=True)
-    def inertia(cells, volume, mass, V, b):
-        for e in range(cells.shape[0]):
+                    for i in range(dim):
+                        s = 0.0
+                        for J in range(dim):
+                            s += T[e * n_points + q, i, J] * g[a, J]
+                        f[a, i] -= w[e, q] * s
             for a in range(nodes):
                 row = cells[e, a]
                 if row < b.shape[0]:
                     for i in range(dim):
-                        s = 0.0
-                        for m in range(nodes):
-                            s += mass[a, m] * V[cells[e, m], i]
-                        b[row, i] += volume[e] * s
+                        b[row, i] += f[a, i]
 
     @njit(cache=True)
     def kinetic(cells, volume, mass, u, v):
@@ -113,10 +110,10 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                     total += volume[e] * mass[a, m] * s
         return total
 
-    @njit(cache=True)
+    @njit(inline="always")
     def add_stiffness(g, C, factor, Cg, K):
-        """Add  factor g_a . C . g_b  to the blocks a <= b of K[a, b]."""
-        for b in range(nodes):
+        """Add  factor g_a . C . g_b  to the blocks 0 < a <= b of K[a, b]."""
+        for b in range(1, nodes):
             for i in range(dim):
                 for k in range(dim):
                     for J in range(dim):
@@ -124,7 +121,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                         for L in range(dim):
                             s += C[i, J, k, L] * g[b, L]
                         Cg[i, k, J] = factor * s
-            for a in range(b + 1):
+            for a in range(1, b + 1):
                 for i in range(dim):
                     for k in range(dim):
                         s = 0.0
@@ -132,21 +129,50 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                             s += g[a, J] * Cg[i, k, J]
                         K[a, b, i, k] += s
 
+    @njit(inline="always")
+    def close(K):
+        """Fill the blocks K[0, b]: a translation costs nothing, sum_a g_a = 0."""
+        for b in range(nodes):
+            for i in range(dim):
+                for k in range(dim):
+                    K[0, b, i, k] = 0.0
+        for b in range(1, nodes):
+            for a in range(1, b):
+                for i in range(dim):
+                    for k in range(dim):
+                        K[0, b, i, k] -= K[a, b, i, k]
+                        K[0, a, i, k] -= K[a, b, k, i]
+            for i in range(dim):
+                for k in range(dim):
+                    K[0, b, i, k] -= K[b, b, min(i, k), max(i, k)]
+        for b in range(1, nodes):
+            for i in range(dim):
+                for k in range(dim):
+                    K[0, 0, i, k] -= K[0, b, i, k]
+
+    @njit(inline="always")
+    def clear(K):
+        for a in range(1, nodes):
+            for b in range(a, nodes):
+                for i in range(dim):
+                    for k in range(dim):
+                        K[a, b, i, k] = 0.0
+
     @njit(cache=True)
     def tangent(cells, basis, table, w, C, volume, mass, A_M, A_K, node_ptr, slots, values):
         n_points = table.shape[0]
         g, Cg = np.empty((nodes, dim)), np.empty((dim, dim, dim))
         K = np.empty((nodes, nodes, dim, dim))
         for e in range(cells.shape[0]):
-            for a in range(nodes):
-                for b in range(a, nodes):
-                    for i in range(dim):
-                        for k in range(dim):
-                            K[a, b, i, k] = 0.0
-                        K[a, b, i, i] = A_M * volume[e] * mass[a, b]
+            clear(K)
             for q in range(n_points):
                 shape_gradients(basis[e], table[q], g)
                 add_stiffness(g, C[e * n_points + q], A_K * w[e, q], Cg, K)
+            close(K)
+            for a in range(nodes):
+                for b in range(a, nodes):
+                    for i in range(dim):
+                        K[a, b, i, i] += A_M * volume[e] * mass[a, b]
             for a in range(nodes):
                 row = cells[e, a]
                 if row >= node_ptr.shape[0] - 1:
@@ -169,10 +195,11 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
         g, Cg = np.empty((nodes, dim)), np.empty((dim, dim, dim))
         half = np.empty((nodes, nodes, dim, dim))
         for e in range(cells.shape[0]):
-            half[:] = 0.0
+            clear(half)
             for q in range(n_points):
                 shape_gradients(basis[e], table[q], g)
                 add_stiffness(g, C[e * n_points + q], w[e, q], Cg, half)
+            close(half)
             for a in range(nodes):
                 for b in range(a, nodes):
                     for i in range(dim):
@@ -181,6 +208,6 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                             K[e, b * dim + k, a * dim + i] = half[a, b, i, k]
 
     return SimpleNamespace(
-        gradient=gradient, contract=contract, forces=forces, inertia=inertia, kinetic=kinetic, tangent=tangent,
+        gradient=gradient, contract=contract, forces=forces, kinetic=kinetic, tangent=tangent,
         matrices=matrices,
     )  # fmt: skip
