@@ -250,7 +250,10 @@ class Solid(Table):
     density: Annotated[Real, Field(gt=0, description="kg/m^3")]
     young: Annotated[Real, Field(gt=0, description="Pa")]
     poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
-    material: Literal["green", "linear", "neohookean", "stable-neohookean"] = "green"
+    material: Literal["green", "neohookean", "stable-neohookean", "linear"] = "green"
+    tangent: Annotated[
+        Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
+    ] = "exact"
     elements: Annotated[Literal["linear", "quadratic"], Field(description="order of the shape functions")] = "linear"
     volumetric: Annotated[
         Literal["full", "reduced"], Field(description="integration of lambda's part; reduced does not lock")
