@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from petfsi.fields.solid.pattern import Pattern
@@ -18,7 +20,7 @@ class Supports:
 
     Parameters
     ----------
-    solids : dict of str to Solid
+    solids : mapping of str to Solid
         Of the scene.
     points : ndarray, shape (n, dim)
         Reference points of the whole mesh.
@@ -26,6 +28,8 @@ class Supports:
         The body of each node.
     number : ndarray of int, shape (n,)
         Global number of each node.
+    components : tuple of str
+        What a node's unknowns are called in the scene: x, y, ...
 
     Attributes
     ----------
@@ -33,9 +37,12 @@ class Supports:
         Global numbers, ascending.
     """
 
-    def __init__(self, solids: dict[str, Solid], points: np.ndarray, node_body: np.ndarray, number: np.ndarray):
-        dim = points.shape[1]
-        rule = np.full((len(points), dim), -1, dtype=np.int32)
+    def __init__(
+        self, solids: Mapping[str, Solid], points: np.ndarray, node_body: np.ndarray, number: np.ndarray,
+        components: tuple[str, ...],
+    ):  # fmt: skip
+        width = len(components)
+        rule = np.full((len(points), width), -1, dtype=np.int32)
         speeds: list[Expression] = []
         for body, (name, solid) in enumerate(solids.items()):
             nodes = np.flatnonzero(node_body == body)
@@ -43,11 +50,10 @@ class Supports:
                 key = f"solids.{name}.supports.{n}"
                 held = nodes[supported(support, points[nodes], key)]
                 for letter in dict.fromkeys(support.fix):
-                    axis = "xyz".index(letter)
-                    rule[held, axis] = len(speeds)
+                    rule[held, components.index(letter)] = len(speeds)
                     speeds.append(Expression(support.velocity.get(letter, 0.0), key=f"{key}.velocity.{letter}"))
         node, direction = np.nonzero(rule >= 0)
-        unknowns = dim * number[node].astype(np.int64) + direction
+        unknowns = width * number[node].astype(np.int64) + direction
         order = np.argsort(unknowns)
         self.unknowns = unknowns[order]
         chosen, where = rule[node, direction][order], points[node[order]]
