@@ -1,6 +1,7 @@
 """What the tests of beams share: rows of elements, dense matrices, Newton's iteration."""
 
 import numpy as np
+from scipy.linalg import eigh
 
 from petfsi.fields.beam.elements import THEORIES, BeamElements, Sections
 
@@ -60,11 +61,9 @@ def equilibrium(elements, d, load, held, tolerance=1e-8):
     raise AssertionError(f"Newton's iteration does not converge: {norms}")
 
 
-def frequencies(elements, n, held, count):
-    """Return the lowest angular frequencies of small oscillations about rest."""
-    from scipy.linalg import eigh
-
-    free = np.setdiff1d(np.arange(3 * n), held)
-    _, _, K = respond(elements, np.zeros((n, 3)))
-    M = added(elements, elements.mass, n)
+def frequencies(elements, d, held, count):
+    """Return the lowest angular frequencies of small oscillations about d."""
+    free = np.setdiff1d(np.arange(d.size), held)
+    _, _, K = respond(elements, d)
+    M = added(elements, elements.mass, len(d))
     return np.sqrt(eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[:count])

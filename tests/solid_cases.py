@@ -121,12 +121,16 @@ def elements_of(points, cells):
 
 
 def pattern_of(points, cells):
-    n = len(points)
+    return pattern_at(cells, len(points), points.shape[1])
+
+
+def pattern_at(cells, n, width):
+    """Return the pattern of a mesh of ``n`` nodes on one rank."""
     everything = np.arange(n)
     return Pattern.of(
-        LocalMesh(points, cells, np.zeros(len(cells), np.int32), np.arange(len(cells)), np.ones(len(cells), bool),
-                  everything.astype(np.int32), everything, Layout(n, 0, n)),
-        points.shape[1],
+        LocalMesh(np.zeros((n, 2)), cells, np.zeros(len(cells), np.int32), np.arange(len(cells)),
+                  np.ones(len(cells), bool), everything.astype(np.int32), everything, Layout(n, 0, n)),
+        width,
     )  # fmt: skip
 
 
