@@ -80,6 +80,7 @@ class BeamSolid(NodalSolid):
         self._held_columns = held[self._columns]
         self._counts = np.array(comm.allgather(self.layout.n_local))
         self._seen: tuple[np.ndarray, np.ndarray] | None = None
+        self._slopes = np.zeros((0, 1))
         self._surface: Surface | None = None
         self._places: dict[tuple[str, tuple[float, ...]], AxisPlace] = {}
         self._static = self._strips()

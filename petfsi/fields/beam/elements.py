@@ -55,7 +55,7 @@ class Sections:
     ) -> Sections:
         """Return plates of a thickness h (m) that may contract across their width (plane stress).
 
-            EA = E h,    GA = 5/6 G h,  G = E / 2(1 + nu),    EI = E h^3 / 12,    rho A = rho h,    rho I = rho h^3 / 12 .
+            EA = E h,   GA = 5/6 E h / 2(1 + nu),   EI = E h^3 / 12,   rho A = rho h,   rho I = rho h^3 / 12 .
 
         Parameters
         ----------
