@@ -256,7 +256,7 @@ def _probes(scene: Scene) -> Problems:
         elif probe.quantity == "angle" and scene.solids[probe.of].shape.beam is None:
             yield Problem(f"{key}.quantity", probe.quantity, "only a beam has an angle", (f"{key}.of",))
         elif probe.quantity not in (*SOLID_QUANTITIES, "angle"):
-            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}"
+            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}, a beam an angle, too"
             yield Problem(f"{key}.quantity", probe.quantity, allowed, (f"{key}.of",))
 
 
