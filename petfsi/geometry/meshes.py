@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
+from petfsi.geometry.beams import strip_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.scene.schema import Box, Shape, Solid
@@ -96,7 +97,7 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
     Parameters
     ----------
     solid : Solid
-        The table; its shape is a box or a ball with cells, or a mesh file.
+        The table; its shape is a box or a ball with cells, a beam (then its strip is meshed), or a mesh file.
     dim : int
         2 for triangles, 3 for tetrahedra.
     key : str
@@ -115,6 +116,8 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
         points, cells = read_mesh(shape, dim, key, directory)
         _check(points, cells, f"{key} = {shape.mesh!r}")
         return points, cells
+    if shape.beam is not None:
+        return strip_mesh(shape.beam)
     if shape.ball is not None and shape.ball.cells is not None:
         return ball_mesh(shape.ball, dim)
     if shape.box is None or shape.box.cells is None:
