@@ -190,6 +190,7 @@ _STAND_IN: dict[str, Any] = {
     "quantity": "velocity",
     "where": "all",
     "fix": ["x"],
+    "tag": "facets",
 }
 _VECTORS = ("origin", "size", "cells", "centre", "start", "point", "normal", "at")
 
