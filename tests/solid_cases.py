@@ -125,7 +125,8 @@ def pattern_of(points, cells):
     everything = np.arange(n)
     return Pattern.of(
         LocalMesh(points, cells, np.zeros(len(cells), np.int32), np.arange(len(cells)), np.ones(len(cells), bool),
-                  everything.astype(np.int32), everything, Layout(n, 0, n))
+                  everything.astype(np.int32), everything, Layout(n, 0, n)),
+        points.shape[1],
     )  # fmt: skip
 
 

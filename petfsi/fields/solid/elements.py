@@ -181,10 +181,11 @@ class Elements:
             damping, power = damping + lost, power + done
         return damping, power
 
-    def nodal_mass(self, n: int) -> np.ndarray:
-        """Return the mass of each of the first ``n`` nodes: the row sums of M, in kg."""
+    def uniform_load(self, n: int) -> np.ndarray:
+        """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, dim), kg."""
         share = np.repeat(self.bodies.density[self.body] * self.volume / (self.dim + 1), self.dim + 1)
-        return np.bincount(self.cells.ravel(), weights=share, minlength=n)[:n]
+        mass = np.bincount(self.cells.ravel(), weights=share, minlength=n)[:n]
+        return np.eye(self.dim)[:, None, :] * mass[:, None]
 
 
 def _compile(dim: int) -> SimpleNamespace:

@@ -19,8 +19,8 @@ class Pattern:
     Attributes
     ----------
     node_ptr : ndarray of int32, shape (n_owned + 1,)
-        Rows of nodes: entry ``s`` is a dim x dim block.
-    slots : ndarray of int32, shape (ne, dim + 1, dim + 1)
+        Rows of nodes: entry ``s`` is a width x width block.
+    slots : ndarray of int32, shape (ne, n, n), n nodes an element
         The block of each pair of an element's nodes; -1 where the row belongs to another rank.
     indptr, indices : ndarray of IntType
         Rows of unknowns; columns are global, sorted.
@@ -32,10 +32,9 @@ class Pattern:
     indices: np.ndarray
 
     @classmethod
-    def of(cls, mesh: LocalMesh) -> Pattern:
-        """Return the pattern of nodes that share an element."""
-        dim = mesh.points.shape[1]
-        corners = dim + 1
+    def of(cls, mesh: LocalMesh, width: int) -> Pattern:
+        """Return the pattern of nodes that share an element, with ``width`` unknowns each."""
+        corners = mesh.cells.shape[1]
         rows = np.repeat(mesh.cells, corners, axis=1).ravel()
         columns = np.tile(mesh.number[mesh.cells], (1, corners)).ravel()
         mine = rows < mesh.n_owned
@@ -47,11 +46,10 @@ class Pattern:
         node_ptr, neighbours = graph.indptr.astype(np.int32), graph.indices.astype(IntType)
         slots = np.full((len(mesh.cells), corners, corners), -1, dtype=np.int32)
         _find_slots(mesh.cells, mesh.number, node_ptr, neighbours, slots)
-        width = np.diff(node_ptr)
-        indptr = np.zeros(dim * mesh.n_owned + 1, dtype=IntType)
-        np.cumsum(np.repeat(dim * width, dim), out=indptr[1:])
+        indptr = np.zeros(width * mesh.n_owned + 1, dtype=IntType)
+        np.cumsum(np.repeat(width * np.diff(node_ptr), width), out=indptr[1:])
         indices = np.empty(indptr[-1], dtype=IntType)
-        _expand(dim, node_ptr, neighbours, indices)
+        _expand(width, node_ptr, neighbours, indices)
         return cls(node_ptr, slots, indptr, indices)
 
 
@@ -67,11 +65,11 @@ def _find_slots(cells, number, node_ptr, neighbours, slots):
 
 
 @njit(cache=True)
-def _expand(dim, node_ptr, neighbours, indices):
+def _expand(width, node_ptr, neighbours, indices):
     k = 0
     for row in range(node_ptr.shape[0] - 1):
-        for _ in range(dim):
+        for _ in range(width):
             for s in range(node_ptr[row], node_ptr[row + 1]):
-                for axis in range(dim):
-                    indices[k] = dim * neighbours[s] + axis
+                for component in range(width):
+                    indices[k] = width * neighbours[s] + component
                     k += 1

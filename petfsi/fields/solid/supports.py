@@ -15,7 +15,6 @@ from petfsi.petsc import Layout
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Solid
 
-
 #: Fraction of the first step over which the initial velocity of a prescribed displacement is measured.
 INSTANT = 1e-3
 
@@ -27,7 +26,7 @@ class Supports:
 
     Parameters
     ----------
-    solids : dict of str to Solid
+    solids : mapping of str to Solid
         Of the scene.
     points : ndarray, shape (n, dim)
         Reference points of the whole mesh.
@@ -35,6 +34,8 @@ class Supports:
         The body of each node.
     number : ndarray of int, shape (n,)
         Global number of each node.
+    components : tuple of str
+        What a node's unknowns are called in the scene: x, y, ...
     tags : mapping of str to Tags
         Of the bodies whose mesh files have some that the scene names.
 
@@ -47,11 +48,11 @@ class Supports:
     """
 
     def __init__(
-        self, solids: dict[str, Solid], points: np.ndarray, node_body: np.ndarray, number: np.ndarray,
-        tags: Mapping[str, Tags],
+        self, solids: Mapping[str, Solid], points: np.ndarray, node_body: np.ndarray, number: np.ndarray,
+        components: tuple[str, ...], tags: Mapping[str, Tags],
     ) -> None:  # fmt: skip
-        dim = points.shape[1]
-        rule = np.full((len(points), dim), -1, dtype=np.int32)
+        width = len(components)
+        rule = np.full((len(points), width), -1, dtype=np.int32)
         rules: list[tuple[str, Expression]] = []
         for body, (name, solid) in enumerate(solids.items()):
             nodes = np.flatnonzero(node_body == body)
@@ -59,12 +60,12 @@ class Supports:
                 key = f"solids.{name}.supports.{n}"
                 held = nodes[located(support.where, points[nodes], key, tags.get(name, {}))]
                 for letter in dict.fromkeys(support.fix):
-                    rule[held, "xyz".index(letter)] = len(rules)
+                    rule[held, components.index(letter)] = len(rules)
                     quantity = "displacement" if letter in support.displacement else "velocity"
                     source = getattr(support, quantity).get(letter, 0.0)
                     rules.append((quantity, Expression(source, key=f"{key}.{quantity}.{letter}")))
         node, direction = np.nonzero(rule >= 0)
-        unknowns = dim * number[node].astype(np.int64) + direction
+        unknowns = width * number[node].astype(np.int64) + direction
         order = np.argsort(unknowns)
         self.unknowns = unknowns[order]
         self._assign(rules, rule[node, direction][order], points[node[order]])
@@ -132,18 +133,18 @@ class Supports:
         time, h : float
             When it begins, and its length, s.
         """
-        dim = motion.displacement.shape[1]
+        width = motion.displacement.shape[1]
         unknowns = self.unknowns[self.placed]
         mine = np.flatnonzero((unknowns >= layout.start) & (unknowns < layout.end))
-        rows, axes = np.divmod(unknowns[mine] - layout.start, dim)
+        rows, components = np.divmod(unknowns[mine] - layout.start, width)
         past = tuple(values[rows] for values in motion.past)
         there = Motion(motion.displacement[rows], motion.velocity[rows], past, motion.past_dt)
         arrays = {f.name: getattr(stage, f.name) for f in fields(stage)}
         staged = replace(stage, **{name: a[rows] for name, a in arrays.items() if isinstance(a, np.ndarray)})
         ends = [
-            integrator.finish(there, staged, np.full((len(rows), dim), w), h).displacement[np.arange(len(rows)), axes]
-            for w in (0.0, 1.0)
+            integrator.finish(there, staged, np.full((len(rows), width), w), h).displacement for w in (0.0, 1.0)
         ]
+        ends = [end[np.arange(len(rows)), components] for end in ends]
         share = np.zeros(len(unknowns))
         share[mine] = (self.displacements(time + h)[mine] - ends[0]) / (ends[1] - ends[0])
         result = np.empty_like(share)

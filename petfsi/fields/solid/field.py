@@ -1,0 +1,308 @@
+"""Solids whose unknowns sit on nodes: the step, the supports and the state that all of them share."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.partition import Fetch, distribute, slab
+from petfsi.fields.solid.pattern import Pattern
+from petfsi.fields.solid.supports import Elimination, Supports
+from petfsi.geometry.meshes import SimplexMesh
+from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage
+from petfsi.petsc import Layout, new_block, set_csr
+from petfsi.scene.expressions import Expression
+from petfsi.scene.schema import Number, Scene, Solid
+
+
+class ElementLibrary(Protocol):
+    """What a solid's elements offer; arrays are over all local nodes, shape (n, width), but for ``b`` (owned ones)."""
+
+    def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
+        """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective."""
+        ...
+
+    def uniform_load(self, n: int) -> np.ndarray:
+        """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, width), kg."""
+        ...
+
+    def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
+        """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
+        ...
+
+    def powers(
+        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
+    ) -> tuple[float, float]:
+        """Return what damping takes and what g does against the step's forces, W. Not collective."""
+        ...
+
+
+class NodalSolid(SolidField):
+    """The solids of a scene; the unknown is the velocity w of every node where the integrator takes the forces.
+
+    A step solves  A w = b + J p  (see ``integrators``) and moves the nodes by the integrator's rule. Unknown
+    ``width * node + component`` in the partition's numbering; the first ``dim`` components are along the axes.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    scene : Scene
+    solids : dict of str to Solid
+        The bodies of this field.
+    mesh : SimplexMesh
+        All of them, the same on every rank.
+    components : tuple of str
+        What a node's unknowns are called in the scene.
+
+    Attributes
+    ----------
+    names : list of str
+        The bodies, in the order of the scene.
+    width : int
+        Unknowns a node.
+    extent : float
+        Largest side of the bounding box of all bodies at rest, m.
+    reference : ndarray, shape (n_owned, dim)
+        Positions of this rank's nodes at rest, m.
+    displacement, velocity : ndarray, shape (n_owned, width)
+        Of this rank's nodes, m and m/s.
+    """
+
+    name = "solid"
+
+    def __init__(
+        self, comm: MPI.Comm, scene: Scene, solids: Mapping[str, Solid], mesh: SimplexMesh, components: tuple[str, ...]
+    ):
+        self.comm = comm
+        self.dim: int = scene.dim
+        self.width = len(components)
+        self.names = list(solids)
+        self.extent = float(np.ptp(mesh.points, axis=0).max())
+        self._node_body = np.empty(len(mesh.points), dtype=np.int32)
+        self._node_body[mesh.cells] = mesh.body[:, None]
+        self._mesh, self._number = distribute(comm, mesh)
+        n_owned = self._mesh.n_owned
+        self.reference = self._mesh.points[:n_owned]
+        self.layout = Layout.of(comm, self.width * n_owned)
+        self._elements = self._make_elements(solids)
+        self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
+        self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
+        self._uniform = self._elements.uniform_load(n_owned)
+        self._reference_mass = comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points)
+
+        self._supports = Supports(solids, mesh.points, self._node_body, self._number, components)
+        self._set_pattern()
+        self._set_exchange(mesh)
+        self._set_motion(mesh, solids)
+
+    @abstractmethod
+    def _make_elements(self, solids: Mapping[str, Solid]) -> ElementLibrary:
+        """Return the elements of ``self._mesh``."""
+
+    @abstractmethod
+    def near_null_space(self) -> list[np.ndarray]:
+        """Return the rigid motions about the origin of coordinates: translations, then rotations."""
+
+    # ---- set-up -----------------------------------------------------------------------------------------------
+
+    def _set_motion(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> None:
+        initial = {name: solid.initial for name, solid in solids.items()}
+        mine = self._mesh.natural[: self._mesh.n_owned]
+        moved = {name: ("displacement", start.displacement) for name, start in initial.items()}
+        thrown = {name: ("velocity", start.velocity) for name, start in initial.items()}
+        self.displacement = _evaluate(moved, mesh.points, self._node_body, self.width)[mine]
+        self.velocity = _evaluate(thrown, mesh.points, self._node_body, self.width)[mine]
+        self.moved = np.zeros(self.layout.n_local)
+        self._stage: Stage | None = None
+        self._geometry: np.ndarray | None = None
+        self._loaded: tuple[Stage, State, np.ndarray] | None = None
+        self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
+        self._past_dt = 0.0
+        self._prescribed = self._supports.velocities(0.0).copy()
+        held = self._supports.unknowns
+        here = (held >= self.layout.start) & (held < self.layout.end)
+        local = self.width * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.width)
+        self._is_held = np.isin(local, held)
+        damping = [(solid.damping.mass, solid.damping.stiffness) for solid in solids.values()]
+        self._loses = self._supports.move or bool(np.any(damping))
+        self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
+
+    def _set_pattern(self) -> None:
+        self._pattern = Pattern.of(self._mesh, self.width)
+        self._elimination = Elimination(self._pattern, self.layout, self._supports.unknowns)
+        self._values = np.zeros(len(self._pattern.indices))
+        self.rhs = np.zeros(self.layout.n_local)
+        self.block = new_block(self.comm, self.layout, self.layout, block_size=self.width)
+        set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=True)
+        vectors = []
+        for mode in self.near_null_space():
+            vector = self.block.createVecRight()
+            vector.setArray(mode)
+            vectors.append(vector)
+        self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
+        self._diagonal = (0.0, 0.0), 1.0
+
+    def _set_exchange(self, mesh: SimplexMesh) -> None:
+        """Prepare the messages between owned, shared and naturally ordered nodes."""
+        comm, nodes = self.comm, self._mesh.nodes
+        begin, end = slab(len(self._number), comm.rank, comm.size)
+        self._share = Fetch(comm, nodes, self._mesh.number[nodes.n_local :])
+        self._to_natural = Fetch(comm, nodes, self._number[begin:end])
+        self._from_natural = Fetch(comm, Layout.of(comm, end - begin), self._mesh.natural[: nodes.n_local])
+        self._slab = begin, end, len(self._number)
+
+    # ---- the step ---------------------------------------------------------------------------------------------
+
+    def unknown(self) -> np.ndarray:
+        """Return w of the step last accepted, flat."""
+        return self._integrator.solved(self._motion()).ravel().copy()
+
+    def predict(self, time: float, dt: float) -> None:
+        """Take the geometry of the step: from here until ``accept`` the surface is where the tangent is taken."""
+        self._stage = self._integrator.stage(self._motion(), dt)
+        self._geometry = self._stage.tangent_at
+
+    def assemble(self, time: float, dt: float) -> None:
+        """Refresh A and b for the step from ``time`` to ``time + dt``. Collective."""
+        stage = self._stage or self._integrator.stage(self._motion(), dt)
+        b = self.rhs.reshape(-1, self.width)
+        diagonal = self._mean_diagonal(stage)
+        local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
+        state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
+        self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
+        gravity = np.zeros(self.dim)
+        for axis, g in enumerate(self._gravity):
+            gravity[axis] = float(g(t=time + self._integrator.moment(dt)))
+            if gravity[axis]:
+                b += gravity[axis] * self._uniform[axis]
+        self._loaded = stage, state, gravity
+        self._prescribe(time, dt)
+        self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
+        set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
+        self.row_scale = dt / self._reference_mass
+        self.n_assembled += 1
+
+    def accept(self, x: np.ndarray, time: float, dt: float) -> None:
+        """Take the velocities w and move the nodes."""
+        w, motion = x.reshape(-1, self.width).copy(), self._motion()
+        stage = self._stage or self._integrator.stage(motion, dt)
+        motion = self._integrator.finish(motion, stage, w, dt)
+        self.moved = (motion.displacement - self.displacement).ravel()
+        self.displacement, self.velocity = motion.displacement, motion.velocity
+        self._past, self._past_dt = motion.past, motion.past_dt
+        self._stage = self._geometry = None
+
+    def _motion(self) -> Motion:
+        return Motion(self.displacement, self.velocity, self._past, self._past_dt)
+
+    def set_scale(self, reference_mass: float) -> None:
+        """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``."""
+        self._reference_mass = reference_mass
+
+    def _mean_diagonal(self, stage: Stage) -> float:
+        """Return the mean of A's diagonal at rest: what stands in the rows of prescribed unknowns. Collective."""
+        factors, diagonal = self._diagonal
+        if factors != (stage.a, stage.k):
+            rest = np.zeros((len(self._mesh.points), self.width))
+            state, b = State(rest, rest, rest), np.empty((self._mesh.n_owned, self.width))
+            self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
+            rows = np.repeat(np.arange(self.layout.n_local), np.diff(self._pattern.indptr))
+            total = self._values[self._pattern.indices == rows + self.layout.start].sum()
+            diagonal = self.comm.allreduce(float(total)) / self.layout.n_global
+            self._diagonal = (stage.a, stage.k), diagonal
+        return diagonal
+
+    def _prescribe(self, time: float, dt: float) -> None:
+        instants = self._integrator.instants(dt)
+        self._prescribed = np.mean([self._supports.velocities(time + t).copy() for t in instants], axis=0)
+
+    def _with_shared(self, owned: np.ndarray) -> np.ndarray:
+        """Return values at all nodes of this rank's elements. Collective."""
+        return np.concatenate((owned, self._share(owned)))
+
+    def fixed_velocity(self) -> np.ndarray:
+        """Return w of the step last assembled at prescribed unknowns, zero at free ones."""
+        g = np.zeros(self.layout.n_global)
+        g[self._supports.unknowns] = self._prescribed
+        return g
+
+    # ---- what others read -------------------------------------------------------------------------------------
+
+    def stock(self) -> Stock:
+        """Return this rank's share of momentum, kinetic and elastic energy."""
+        both = self._with_shared(np.concatenate((self.displacement, self.velocity), axis=1))
+        d, u = both[:, : self.width], both[:, self.width :]
+        kinetic, elastic = self._elements.energies(d, u, self._mesh.counted)
+        return Stock(np.tensordot(self._uniform, self.velocity), kinetic, elastic)
+
+    def work(self, dt: float) -> Work:
+        """Return this rank's share of what was done in the step last accepted.
+
+        Gravity acts along the way that nodes moved; damping (w . C w) and supports, with the reaction that is the
+        residual of their equations without other fields' forces, act at w for dt.
+        """
+        if self._loaded is None:
+            return Work()
+        stage, state, gravity = self._loaded
+        weight = np.tensordot(gravity, self._uniform, axes=1)
+        fallen = float(np.vdot(weight, self.moved))
+        if not self._loses:
+            return Work(gravity=fallen)
+        w = self._with_shared(self._integrator.solved(self._motion()))
+        g = np.where(self._is_held, w, 0.0)
+        damping, power = self._elements.powers(state, stage.a, stage.k, w, g, self._mesh.counted)
+        power -= float(np.vdot(weight, g[: self._mesh.n_owned]))
+        return Work(fallen, dt * damping, dt * power)
+
+    def energies(self) -> dict[str, float]:
+        """Return the kinetic and elastic energy of all bodies, J (per metre in 2D). Collective."""
+        d, u = self._with_shared(self.displacement), self._with_shared(self.velocity)
+        total = np.empty(2)
+        self.comm.Allreduce(np.array(self._elements.energies(d, u, self._mesh.counted)), total)
+        return {"kinetic": float(total[0]), "elastic": float(total[1])}
+
+    def state(self) -> dict[str, Slab]:
+        """Return displacement, velocity and what the integrator remembers, in the mesh's own order. Collective."""
+        past = dict(zip(self._integrator.past, map(self._natural_rows, self._past), strict=True))
+        return self._present() | past | ({"past_dt": scalar_slab(self.comm, self._past_dt)} if past else {})
+
+    def restore(self, read: Reader) -> None:
+        """Take the state back. Collective."""
+        begin, end, _ = self._slab
+
+        def nodes(name: str) -> np.ndarray:
+            return self._from_natural(np.asarray(read(name, (begin, 0), (end - begin, self.width)), dtype=float))
+
+        self.displacement, self.velocity = nodes("displacement"), nodes("velocity")
+        self._past = tuple(nodes(name) for name in self._integrator.past)
+        if self._past:
+            self._past_dt = float(read("past_dt", (0,), (1,))[0])
+        self._stage = self._geometry = None
+
+    def _present(self) -> dict[str, Slab]:
+        return {"displacement": self._natural_rows(self.displacement), "velocity": self._natural_rows(self.velocity)}
+
+    def _natural_rows(self, owned: np.ndarray) -> Slab:
+        begin, _, n = self._slab
+        return Slab(self._to_natural(owned), (begin, 0), (n, owned.shape[1]))
+
+
+def _evaluate(
+    given: dict[str, tuple[str, list[Number] | None]], points: np.ndarray, node_body: np.ndarray, width: int
+) -> np.ndarray:
+    """Return the initial values at all nodes; every rank evaluates all, so that all meet the same error."""
+    values = np.zeros((len(points), width))
+    for body, (name, (quantity, components)) in enumerate(given.items()):
+        nodes = np.flatnonzero(node_body == body)
+        coordinates = {"z": 0.0, **dict(zip("xyz", points[nodes].T, strict=False))}
+        for axis, source in enumerate(components or []):
+            expression = Expression(source, key=f"solids.{name}.initial.{quantity}.{axis}")
+            values[nodes, axis] = expression(t=0.0, **coordinates)
+    return values
