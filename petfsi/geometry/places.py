@@ -35,7 +35,7 @@ def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
     directory : Path
         What the mesh file's path is relative to.
     """
-    places = [item.where for item in (*solid.supports, *solid.loads)]
+    places = [*(support.where for support in solid.supports), *(load.where for load in solid.loads)]
     if solid.shape.mesh is None or not any(isinstance(where, Tagged) for where in places):
         return {}
     mesh = open_mesh(solid.shape, f"{key}.shape.mesh", directory)

@@ -250,9 +250,9 @@ class Load(Table):
     """A traction or a pressure on boundary facets, or a force at a point. x, y, z are reference positions."""
 
     where: Annotated[Where | None, Field(description=_WHERE)] = None
-    traction: Annotated[
-        list[Number] | None, Field(description="N/m^2 of reference area; may depend on x, y, z, t")
-    ] = None
+    traction: Annotated[list[Number] | None, Field(description="N/m^2 of reference area; may depend on x, y, z, t")] = (
+        None
+    )
     pressure: Annotated[Number | None, Field(description="Pa; may depend on x, y, z, t")] = None
     follower: Annotated[Flag | None, Field(description="whether it turns with the facets")] = None
     at: Annotated[Vector | None, Field(description="m, where the point is at rest")] = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -114,7 +115,14 @@ class Supports:
         return values
 
     def reaching(
-        self, comm: MPI.Comm, layout: Layout, integrator: Integrator, motion: Motion, stage: Stage, time: float, h: float
+        self,
+        comm: MPI.Comm,
+        layout: Layout,
+        integrator: Integrator,
+        motion: Motion,
+        stage: Stage,
+        time: float,
+        h: float,
     ) -> np.ndarray:
         """Return the w of ``unknowns[placed]`` that takes them to where they should be at the step's end. Collective.
 
@@ -139,11 +147,9 @@ class Supports:
         rows, components = np.divmod(unknowns[mine] - layout.start, width)
         past = tuple(values[rows] for values in motion.past)
         there = Motion(motion.displacement[rows], motion.velocity[rows], past, motion.past_dt)
-        arrays = {f.name: getattr(stage, f.name) for f in fields(stage)}
-        staged = replace(stage, **{name: a[rows] for name, a in arrays.items() if isinstance(a, np.ndarray)})
-        ends = [
-            integrator.finish(there, staged, np.full((len(rows), width), w), h).displacement for w in (0.0, 1.0)
-        ]
+        parts: dict[str, Any] = {f.name: getattr(stage, f.name) for f in fields(stage)}
+        staged = replace(stage, **{name: a[rows] for name, a in parts.items() if isinstance(a, np.ndarray)})
+        ends = [integrator.finish(there, staged, np.full((len(rows), width), w), h).displacement for w in (0.0, 1.0)]
         ends = [end[np.arange(len(rows)), components] for end in ends]
         share = np.zeros(len(unknowns))
         share[mine] = (self.displacements(time + h)[mine] - ends[0]) / (ends[1] - ends[0])

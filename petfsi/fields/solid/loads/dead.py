@@ -58,7 +58,9 @@ class DeadLoads:
             else:
                 self._constant += spread @ (expression(**coordinates).reshape(-1, 1) * along)
 
-    def add_point(self, components: Sequence[Expression], at: Coordinates, rows: np.ndarray, weights: np.ndarray) -> None:
+    def add_point(
+        self, components: Sequence[Expression], at: Coordinates, rows: np.ndarray, weights: np.ndarray
+    ) -> None:
         """Add a force (N) at ``at``, of which each of the ``rows`` takes its share. Not collective."""
         for axis, expression in enumerate(components):
             unit = np.zeros_like(self._constant)

@@ -13,7 +13,7 @@ from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.loads.dead import DeadLoads
 from petfsi.fields.solid.loads.followers import FollowerPressure, FollowerTraction
 from petfsi.fields.solid.loads.rules import with_middles
-from petfsi.fields.solid.loads.simplices import Simplices
+from petfsi.fields.solid.loads.simplices import Coordinates, Simplices
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.probes import Place
@@ -111,7 +111,7 @@ class Loads:
         assert load.force is not None and load.at is not None
         rows = place.nodes - self._mesh.nodes.start
         mine = (rows >= 0) & (rows < self._mesh.n_owned)
-        at = {"z": 0.0, **dict(zip("xyz", load.at, strict=False))}
+        at: Coordinates = {"z": 0.0, **dict(zip("xyz", load.at, strict=False))}
         self._dead.add_point(_expressions(load.force, f"{key}.force"), at, rows[mine], place.weights[mine])
 
     def _add_facets(self, key: str, load: Load, body: Body, skin: np.ndarray | None) -> None:
@@ -182,7 +182,8 @@ class Loads:
         if not self.follow:
             return total
         total, x = total.copy(), self._mesh.points + at.displacement
-        for load in (*self._pressures, *self._tractions):
+        followers: list[FollowerPressure | FollowerTraction] = [*self._pressures, *self._tractions]
+        for load in followers:
             total += load.facets.gather(load.forces(x, time), len(total))
         return total
 
