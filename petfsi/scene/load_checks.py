@@ -39,11 +39,10 @@ def _kind(key: str, load: Load) -> Problems:
         yield Problem(key, ", ".join(kinds) or ABSENT, allowed, uses)
         return
     wanted, other = ("at", "where") if kinds == ["force"] else ("where", "at")
-    if getattr(load, wanted) is None:
-        yield Problem(f"{key}.{wanted}", ABSENT, f"is missing; a {kinds[0]} needs it", (f"{key}.{kinds[0]}",))
     if getattr(load, other) is not None:
-        allowed = f"a {kinds[0]} has {wanted} instead"
-        yield Problem(f"{key}.{other}", ABSENT, allowed, (f"{key}.{kinds[0]}",))
+        yield Problem(f"{key}.{other}", ABSENT, f"a {kinds[0]} has {wanted} instead", (f"{key}.{kinds[0]}",))
+    elif getattr(load, wanted) is None:
+        yield Problem(f"{key}.{wanted}", ABSENT, f"is missing; a {kinds[0]} needs it", (f"{key}.{kinds[0]}",))
     if kinds == ["force"] and load.follower:
         allowed = "a force at a point of this solid keeps its direction: there is nothing that it could turn with"
         yield Problem(f"{key}.follower", True, allowed, (f"{key}.force",))

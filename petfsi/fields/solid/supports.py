@@ -147,8 +147,9 @@ class Supports:
         rows, components = np.divmod(unknowns[mine] - layout.start, width)
         past = tuple(values[rows] for values in motion.past)
         there = Motion(motion.displacement[rows], motion.velocity[rows], past, motion.past_dt)
-        parts: dict[str, Any] = {f.name: getattr(stage, f.name) for f in fields(stage)}
-        staged = replace(stage, **{name: a[rows] for name, a in parts.items() if isinstance(a, np.ndarray)})
+        arrays = {f.name: getattr(stage, f.name) for f in fields(stage)}
+        parts: dict[str, Any] = {name: a[rows] for name, a in arrays.items() if isinstance(a, np.ndarray)}
+        staged = replace(stage, **parts)
         ends = [integrator.finish(there, staged, np.full((len(rows), width), w), h).displacement for w in (0.0, 1.0)]
         ends = [end[np.arange(len(rows)), components] for end in ends]
         share = np.zeros(len(unknowns))
