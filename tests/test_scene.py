@@ -186,10 +186,10 @@ BROKEN = [
     (
         ["solids.layer.supports.0.where=under"],
         'where = "under"',
-        "'bottom', 'top', 'back', 'front' or 'all' (or a shape",
+        "'front', 'all', 'start' or 'end' (or a shape",
     ),
     (["obstacles.floor.outside='yes'"], 'obstacles.floor.outside = "yes"', "must be true or false"),
-    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'displacement', 'velocity', 'pressure' or"),
+    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'displacement', 'velocity', 'angle', 'pressure' or"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
     (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
     (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell' or 'ray'"),
@@ -371,7 +371,7 @@ BROKEN = [
     ([load("at = [0.5, 0.5], force = [1.0]")], "loads.0.force = [1.0]", "must have 2 items"),
     ([load("at = [0.5, 0.5], force = [1.0, 'x*']")], 'loads.0.force.1 = "x*"', "is not an expression"),
     ([load("where = 'front', pressure = 1.0")], 'loads.0.where = "front"', "bounds z, which dim = 2 does not have"),
-    ([load("where = 'under', pressure = 1.0")], 'loads.0.where = "under"', "'front' or 'all' (or a shape such as"),
+    ([load("where = 'under', pressure = 1.0")], 'loads.0.where = "under"', "'front', 'all', 'start' or 'end' (or a shape such as"),
     ([load("where = { tag = 'lid' }, pressure = 1.0")], 'loads.0.where.tag = "lid"', "a tag is a mesh file's"),
     ([load("where = { mesh = 'a.stl' }, pressure = 1.0")], "loads.0.where.mesh", "must be a box, ball, cylinder or"),
     (
