@@ -2,7 +2,14 @@
 
 import numpy as np
 import pytest
-from solid_cases import DENSITY, LAME, MU, body, field, step
+from mpi4py import MPI
+from solid_cases import DENSITY, LAME, MU, body, step
+
+from petfsi.bench.case import only_options
+from petfsi.errors import SolveError
+from petfsi.fields.solid import SimplexSolid
+from petfsi.scene.schema import Scene
+from petfsi.simulation import Simulation
 
 #: Speed of pressure waves, m/s: strains are those of a block of 1 m thrown at a multiple of it.
 SOUND = np.sqrt((LAME + 2 * MU) / DENSITY)
@@ -14,20 +21,18 @@ THROWN = {
 FOLDED = ["-(x - 2/3) - abs(x - 2/3)", "0.0"]
 
 
-def block(integrator, tangent="projected", stiffness_damping=0.02, **initial):
-    return field(
-        2,
-        integrator=integrator,
-        block=body(
-            2,
-            cells=(6, 6),
-            size=(1.0, 1.0),
-            material="stable-neohookean",
-            tangent=tangent,
-            damping={"stiffness": stiffness_damping / SOUND},
-            initial=initial,
-        ),
-    )
+def scene(integrator, tangent="projected", stiffness_damping=0.02, material="stable-neohookean", **initial):
+    """Return a block of 1 m, steps in which waves cross a tenth of it."""
+    block = body(
+        2, cells=(6, 6), size=(1.0, 1.0), material=material, tangent=tangent,
+        damping={"stiffness": stiffness_damping / SOUND}, initial=initial,
+    )  # fmt: skip
+    time = {"end": 12 / SOUND, "dt": 0.1 / SOUND, "integrator": integrator}
+    return Scene.model_validate({"dim": 2, "time": time, "solids": {"block": block}})
+
+
+def block(*args, **kwargs):
+    return SimplexSolid(MPI.COMM_SELF, scene(*args, **kwargs))
 
 
 def history(solid, steps, dt=0.1 / SOUND):
@@ -77,3 +82,12 @@ def test_exact_tangents_are_what_does_not():
     """The step's matrix is no longer positive then, and a step goes anywhere."""
     energy, _ = history(block("bdf2", "exact", 0.0, velocity=THROWN["stretched"]), 60)
     assert energy.max() > 10 * energy[0]
+
+
+@pytest.mark.parallel([1, 2])
+def test_an_inverted_neohookean_element_is_an_error_on_all_ranks():
+    with only_options(["-options_file", "monolithic.opts"]):
+        sim = Simulation(MPI.COMM_WORLD, scene("bdf2", material="neohookean", tangent="exact", displacement=FOLDED))
+        with pytest.raises(SolveError, match="nan"):
+            sim.prepare()
+            sim.advance()
