@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from petfsi.errors import InputError
+from petfsi.geometry.beams import axis_mesh
 from petfsi.geometry.meshes import build_mesh, read_surface
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets
@@ -41,7 +42,7 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
             mesh = build_mesh(solid, scene.dim, key, scene.directory)
             check_inside_grid(scene, f"{key}.shape", mesh[0])
             for n, support in enumerate(solid.supports):
-                supported(support, mesh[0], f"{key}.supports.{n}")
+                supported(support, _held_points(solid, mesh[0]), f"{key}.supports.{n}")
             meshes[name] = mesh
         except InputError as error:
             mistakes.append(str(error))
@@ -53,7 +54,7 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
 
 
 def supported(support: Support, points: np.ndarray, key: str) -> np.ndarray:
-    """Return which reference points of one body a support holds.
+    """Return which reference points of one body a support holds; those of a beam are given from start to end.
 
     Raises
     ------
@@ -62,6 +63,8 @@ def supported(support: Support, points: np.ndarray, key: str) -> np.ndarray:
     """
     if not isinstance(support.where, str):
         held = inside(support.where, points)
+    elif support.where in ("start", "end"):
+        held = np.arange(len(points)) == (0 if support.where == "start" else len(points) - 1)
     elif support.where == "all":
         held = np.ones(len(points), dtype=bool)
     else:
@@ -73,6 +76,11 @@ def supported(support: Support, points: np.ndarray, key: str) -> np.ndarray:
         lower, upper = points.min(axis=0).tolist(), points.max(axis=0).tolist()
         raise InputError(f"{key}.where: no node of the solid lies there; its nodes reach from {lower} to {upper} m")
     return held
+
+
+def _held_points(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Return what supports hold: the points of a mesh, of a beam those of its axis."""
+    return points if solid.shape.beam is None else axis_mesh(solid.shape.beam)[0]
 
 
 # ---- apart from each other ----------------------------------------------------------------------------------
@@ -99,13 +107,15 @@ def _in_obstacles(scene: Scene, meshes: dict[str, Mesh]) -> list[str]:
 
 
 def _clamped(solid: Solid, points: np.ndarray) -> np.ndarray:
-    """Return which nodes are held on all axes, as those in a wall are."""
-    held = np.zeros(points.shape, dtype=bool)
+    """Return which points are held on all axes (of a beam those at nodes that do not turn either), as in a wall."""
+    components = "xyz"[: points.shape[1]] if solid.shape.beam is None else ("x", "y", "angle")
+    nodes = _held_points(solid, points)
+    held = np.zeros((len(nodes), len(components)), dtype=bool)
     for support in solid.supports:
-        where = supported(support, points, "supports")
-        for axis in support.fix:
-            held[where, "xyz".index(axis)] = True
-    return held.all(axis=1)
+        where = supported(support, nodes, "supports")
+        for component in support.fix:
+            held[where, components.index(component)] = True
+    return np.repeat(held.all(axis=1), len(points) // len(nodes))
 
 
 def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> np.ndarray:
