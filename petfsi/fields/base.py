@@ -68,11 +68,14 @@ class Work:
         Taken by damping.
     boundary : float
         Done, and brought along, by all that lies beyond: supports, inflows, open sides.
+    loads : float
+        Done by body forces and loads.
     """
 
     gravity: float = 0.0
     damping: float = 0.0
     boundary: float = 0.0
+    loads: float = 0.0
 
 
 #: Reads the piece ``[start, start + count)`` of the stored array of that name: ``read(name, start, count)``.

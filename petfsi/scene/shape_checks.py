@@ -15,6 +15,9 @@ MAX_CELLS = 2**31 - 1
 #: Bodies may touch the grid's sides and each other; this fraction of a length is round-off.
 SLACK = 1e-9
 
+OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
+NO_Z = "bounds z, which dim = 2 does not have"
+
 Problems = Iterator[Problem]
 
 

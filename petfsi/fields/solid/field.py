@@ -16,10 +16,13 @@ from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.meshes import SimplexMesh
+from petfsi.geometry.places import Tags, read_tags
 from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage
 from petfsi.petsc import Layout, new_block, set_csr
+from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene, Solid
+from petfsi.scene.stepping import Stepping
 
 
 class ElementLibrary(Protocol):
@@ -41,6 +44,18 @@ class ElementLibrary(Protocol):
         self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
     ) -> tuple[float, float]:
         """Return what damping takes and what g does against the step's forces, W. Not collective."""
+        ...
+
+
+class LoadLibrary(Protocol):
+    """What a solid's loads offer; arrays as of ``ElementLibrary``."""
+
+    def assemble(self, time: float, at: State, k: float, values: np.ndarray | None, b: np.ndarray) -> None:
+        """Add  f(d~) + f' s  to b and  -k f'  to A's values, where forces depend on d. Collective."""
+        ...
+
+    def felt(self, w: np.ndarray) -> np.ndarray:
+        """Return the forces of the step last assembled for its solution, at the owned nodes, N. Not collective."""
         ...
 
 
@@ -97,14 +112,20 @@ class NodalSolid(SolidField):
         self._uniform = self._elements.uniform_load(n_owned)
         self._reference_mass = comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points)
 
-        self._supports = Supports(solids, mesh.points, self._node_body, self._number, components)
+        self._tags = on_root(comm, lambda: _tags(scene, solids))
+        self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
         self._set_pattern()
+        self._loads = self._make_loads(mesh, solids)
         self._set_exchange(mesh)
-        self._set_motion(mesh, solids)
+        self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
 
     @abstractmethod
     def _make_elements(self, solids: Mapping[str, Solid]) -> ElementLibrary:
         """Return the elements of ``self._mesh``."""
+
+    def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> LoadLibrary | None:
+        """Return the loads of ``self._mesh``, or None if there are none. Collective."""
+        return None
 
     @abstractmethod
     def near_null_space(self) -> list[np.ndarray]:
@@ -112,7 +133,7 @@ class NodalSolid(SolidField):
 
     # ---- set-up -----------------------------------------------------------------------------------------------
 
-    def _set_motion(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> None:
+    def _set_motion(self, mesh: SimplexMesh, solids: Mapping[str, Solid], dt: float) -> None:
         initial = {name: solid.initial for name, solid in solids.items()}
         mine = self._mesh.natural[: self._mesh.n_owned]
         moved = {name: ("displacement", start.displacement) for name, start in initial.items()}
@@ -125,7 +146,7 @@ class NodalSolid(SolidField):
         self._loaded: tuple[Stage, State, np.ndarray] | None = None
         self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
         self._past_dt = 0.0
-        self._prescribed = self._supports.velocities(0.0).copy()
+        self._prescribed = self._supports.initial_velocities(dt)
         held = self._supports.unknowns
         here = (held >= self.layout.start) & (held < self.layout.end)
         local = self.width * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.width)
@@ -133,6 +154,9 @@ class NodalSolid(SolidField):
         damping = [(solid.damping.mass, solid.damping.stiffness) for solid in solids.values()]
         self._loses = self._supports.move or bool(np.any(damping))
         self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
+        placed = self._supports.placed
+        here = here[placed]
+        self.displacement.reshape(-1)[held[placed][here] - self.layout.start] = self._supports.displacements(0.0)[here]
 
     def _set_pattern(self) -> None:
         self._pattern = Pattern.of(self._mesh, self.width)
@@ -182,8 +206,10 @@ class NodalSolid(SolidField):
             gravity[axis] = float(g(t=time + self._integrator.moment(dt)))
             if gravity[axis]:
                 b += gravity[axis] * self._uniform[axis]
+        if self._loads is not None:
+            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, self._values, b)
         self._loaded = stage, state, gravity
-        self._prescribe(time, dt)
+        self._prescribe(stage, time, dt)
         self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
         set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
         self.row_scale = dt / self._reference_mass
@@ -219,9 +245,12 @@ class NodalSolid(SolidField):
             self._diagonal = (stage.a, stage.k), diagonal
         return diagonal
 
-    def _prescribe(self, time: float, dt: float) -> None:
-        instants = self._integrator.instants(dt)
+    def _prescribe(self, stage: Stage, time: float, dt: float) -> None:
+        instants, placed = self._integrator.instants(dt), self._supports.placed
         self._prescribed = np.mean([self._supports.velocities(time + t).copy() for t in instants], axis=0)
+        if len(placed):
+            there = self.comm, self.layout, self._integrator, self._motion()
+            self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)
 
     def _with_shared(self, owned: np.ndarray) -> np.ndarray:
         """Return values at all nodes of this rank's elements. Collective."""
@@ -245,21 +274,26 @@ class NodalSolid(SolidField):
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted.
 
-        Gravity acts along the way that nodes moved; damping (w . C w) and supports, with the reaction that is the
-        residual of their equations without other fields' forces, act at w for dt.
+        Gravity and loads act along the way that nodes moved; damping (w . C w) and supports, with the reaction that is
+        the residual of their equations without other fields' forces, act at w for dt.
         """
         if self._loaded is None:
             return Work()
         stage, state, gravity = self._loaded
         weight = np.tensordot(gravity, self._uniform, axes=1)
-        fallen = float(np.vdot(weight, self.moved))
-        if not self._loses:
+        fallen, loaded = float(np.vdot(weight, self.moved)), 0.0
+        if not self._loses and self._loads is None:
             return Work(gravity=fallen)
         w = self._with_shared(self._integrator.solved(self._motion()))
+        if self._loads is not None:
+            load = self._loads.felt(w)
+            loaded, weight = float(np.vdot(load, self.moved)), weight + load
+        if not self._loses:
+            return Work(gravity=fallen, loads=loaded)
         g = np.where(self._is_held, w, 0.0)
         damping, power = self._elements.powers(state, stage.a, stage.k, w, g, self._mesh.counted)
         power -= float(np.vdot(weight, g[: self._mesh.n_owned]))
-        return Work(fallen, dt * damping, dt * power)
+        return Work(fallen, dt * damping, dt * power, loaded)
 
     def energies(self) -> dict[str, float]:
         """Return the kinetic and elastic energy of all bodies, J (per metre in 2D). Collective."""
@@ -292,6 +326,10 @@ class NodalSolid(SolidField):
     def _natural_rows(self, owned: np.ndarray) -> Slab:
         begin, _, n = self._slab
         return Slab(self._to_natural(owned), (begin, 0), (n, owned.shape[1]))
+
+
+def _tags(scene: Scene, solids: Mapping[str, Solid]) -> dict[str, Tags]:
+    return {name: read_tags(solid, scene.dim, f"solids.{name}", scene.directory) for name, solid in solids.items()}
 
 
 def _evaluate(
