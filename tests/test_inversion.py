@@ -45,6 +45,13 @@ def history(solid, steps, dt=0.1 / SOUND):
     return np.array(energy), np.array(quality)
 
 
+def inverted(solid):
+    """Return the part of the triangles that lie on their other side."""
+    now = {name: slab.data for name, slab in solid.output().items()}
+    corners = (now["points"] + now["displacement"])[now["cells"]]
+    return np.mean(np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0)
+
+
 def recovers(energy, quality):
     """Check that elements were inverted, none is at the end, and energy never exceeded that at the start."""
     assert np.all(np.isfinite(energy)) and energy.max() <= energy[0] * (1 + 1e-12)
@@ -62,7 +69,7 @@ def test_a_block_thrown_at_ten_times_its_speed_of_sound_recovers(throw, integrat
 @pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
 def test_a_mesh_with_a_third_of_its_elements_inverted_recovers(integrator):
     solid = block(integrator, displacement=FOLDED)
-    assert np.mean(solid._volume_ratios() < 0) == pytest.approx(1 / 3)
+    assert inverted(solid) == pytest.approx(1 / 3)
     recovers(*history(solid, 60))
 
 
@@ -70,7 +77,7 @@ def test_a_scrambled_mesh_recovers():
     """Every node starts somewhere else: here any element may be inverted, in any direction."""
     solid = block("bdf2")
     solid.displacement = np.random.default_rng(1).uniform(-0.2, 0.2, solid.displacement.shape)
-    assert np.mean(solid._volume_ratios() < 0) > 1 / 4
+    assert inverted(solid) > 1 / 4
     recovers(*history(solid, 60))
 
 
