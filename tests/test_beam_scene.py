@@ -24,7 +24,10 @@ density = 1100.0
 young = 1e6
 poisson = 0.3
 material = "green"
-supports = [{ where = "start", fix = ["x", "angle"], velocity = { angle = "0.1*t" } }, { where = "bottom", fix = ["y"] }]
+supports = [
+    { where = "start", fix = ["x", "angle"], velocity = { angle = "0.1*t" } },
+    { where = "bottom", fix = ["y"] },
+]
 initial = { velocity = [0.0, 0.0, "y"] }
 [probes.tip]
 of = "gate"
@@ -85,7 +88,11 @@ BROKEN = [
     ([f"solids.gate.shape={BOX}"], "probes.tip.quantity", "only a beam has an angle"),
     (["probes.tip.of=fluid"], "probes.tip.quantity", "a fluid has velocity, pressure and smoke"),
     (["probes.tip.quantity=smoke"], "probes.tip.quantity", "a solid has displacement and velocity, a beam an angle"),
-    (["fluid.sides.left={inflow = {speed = 1.0, rest = 'open', region = " + beam() + "}}"], "region.beam", "only a sol"),
+    (
+        ["fluid.sides.left={inflow = {speed = 1.0, rest = 'open', region = " + beam() + "}}"],
+        "region.beam",
+        "only a sol",
+    ),
 ]
 
 
@@ -109,7 +116,10 @@ def test_a_beam_needs_a_plane():
     "sets, said",
     [
         (["solids.gate.supports.0.where={ box = { origin = [0.6, 0.0], size = [0.1, 0.1] } }"], "no node of the solid"),
-        (["obstacles.post={ shape = { box = { origin = [0.4, 0.3], size = [0.2, 0.1] } } }"], "overlaps obstacles.post"),
+        (
+            ["obstacles.post={ shape = { box = { origin = [0.4, 0.3], size = [0.2, 0.1] } } }"],
+            "overlaps obstacles.post",
+        ),
         ([other(beam("[0.5, 0.2]", "[0.5, 0.4]"))], "solids.other.shape: overlaps solids.gate"),
     ],
 )
