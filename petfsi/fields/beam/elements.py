@@ -127,7 +127,7 @@ class BeamElements:
         A_M, A_K = a + self.sections.mass_damping[self.body], k + self.sections.stiffness_damping[self.body]
         A = A_M[:, None, None] * self.mass + A_K[:, None, None] * K
         values[:] = 0.0
-        _scatter_matrix(self.cells, A, pattern.node_ptr, pattern.slots, values)
+        _scatter_matrix(self.cells, A, pattern.node_ptr, pattern.slots[0], values)
         self._gather(self._loads(at, f, K), b)
 
     def forces(self, at: State, b: np.ndarray) -> None:
