@@ -189,7 +189,7 @@ BROKEN = [
         "'front', 'all', 'start' or 'end' (or a shape",
     ),
     (["obstacles.floor.outside='yes'"], 'obstacles.floor.outside = "yes"', "must be true or false"),
-    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'displacement', 'velocity', 'angle', 'pressure' or"),
+    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'velocity', 'angle', 'pressure' or"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
     (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
     (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell' or 'ray'"),
