@@ -1,11 +1,32 @@
 """Materials: stress is the derivative of energy, the tangent that of stress, and neither sees a rotation."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
 
-from petfsi.fields.solid.materials import MATERIALS, lame_parameters
+from petfsi.fields.solid.materials import MATERIALS, lame_parameters, linear, project, projected
 
-STEP = 1e-5
+NONLINEAR = sorted(set(MATERIALS) - {"linear"})
+#: Materials that are finite and smooth for every F.
+INVERTIBLE = ["green", "linear", "stable-neohookean"]
+LAME, MU = lame_parameters(3.0, 0.3)
+#: Stress under uniaxial stretch (E = 1, nu = 0.3): exact solutions, derived, in ten digits.
+UNIAXIAL = np.genfromtxt(
+    Path(__file__).parent / "data" / "uniaxial_hyperelastic_E1_nu0.3.csv", delimiter=",", names=True, skip_header=1
+)
+
+
+def respond(name, F, lame=LAME, mu=MU):
+    """Return W, P and C of one gradient or of many."""
+    F = np.asarray(F)
+    n = F.shape[:-2]
+    H = (F - np.eye(F.shape[-1])).reshape(-1, *F.shape[-2:])
+    answer = MATERIALS[name](H, np.full(len(H), lame), np.full(len(H), mu))
+    return tuple(a.reshape(n + a.shape[1:]) for a in answer)
 
 
 def deformations(dim: int, n: int = 20) -> np.ndarray:
@@ -18,79 +39,206 @@ def rotation(dim: int, seed: int = 2) -> np.ndarray:
 
 
 def central_difference(f, F: np.ndarray) -> np.ndarray:
-    """Return df/dF with the axes of F last."""
-    dim = F.shape[1]
+    """Return df/dF of one F, the axes of F last: central differences of the fourth order."""
+    dim, step = len(F), 1e-3
     columns = []
-    for k in range(dim):
-        for L in range(dim):
-            change = np.zeros((dim, dim))
-            change[k, L] = STEP
-            columns.append((f(F + change) - f(F - change)) / (2 * STEP))
-    return np.stack(columns, axis=-1).reshape(*columns[0].shape, dim, dim)
+    for change in step * np.eye(dim * dim).reshape(-1, dim, dim):
+        near, far = f(F + change) - f(F - change), f(F + 2 * change) - f(F - 2 * change)
+        columns.append((8 * near - far) / (12 * step))
+    return np.stack(columns, axis=-1).reshape(*np.shape(columns[0]), dim, dim)
 
 
-@pytest.fixture(params=[(name, dim) for name in MATERIALS for dim in (2, 3)], ids=lambda p: f"{p[0]}-{p[1]}d")
-def material(request):
-    name, dim = request.param
-    lame, mu = lame_parameters(3.0, 0.3)
-
-    def respond(F):
-        return MATERIALS[name](F - np.eye(dim), np.full(len(F), lame), np.full(len(F), mu))
-
-    return respond, dim
-
-
-def test_stress_is_the_derivative_of_energy(material):
-    respond, dim = material
-    F = deformations(dim)
-    expected = central_difference(lambda F: respond(F)[0], F)
-    np.testing.assert_allclose(respond(F)[1], expected, atol=1e-8 * np.abs(expected).max())
-
-
-def test_tangent_is_the_derivative_of_stress(material):
-    respond, dim = material
-    F = deformations(dim)
-    expected = central_difference(lambda F: respond(F)[1], F)
-    np.testing.assert_allclose(respond(F)[2], expected, atol=1e-8 * np.abs(expected).max())
-
-
-def test_tangent_has_major_symmetry(material):
-    respond, dim = material
-    C = respond(deformations(dim))[2]
-    np.testing.assert_allclose(C, C.transpose(0, 3, 4, 1, 2), atol=1e-13 * np.abs(C).max())
-
-
-def test_energy_sees_no_rotation_and_stress_turns_with_it(material):
-    respond, dim = material
-    F, R = deformations(dim), rotation(dim)
-    W, P, _ = respond(F)
-    turned_W, turned_P, _ = respond(R @ F)
-    np.testing.assert_allclose(turned_W, W, rtol=1e-12)
-    np.testing.assert_allclose(turned_P, R @ P, atol=1e-12)
-    rest_W, rest_P, _ = respond(R[None])
-    assert abs(rest_W[0]) < 1e-28
-    assert np.abs(rest_P).max() < 1e-14
-
-
-def test_small_strain_is_hookes_law(material):
-    respond, dim = material
-    lame, mu = lame_parameters(3.0, 0.3)
+def hooke(dim: int, lame: float = LAME, mu: float = MU) -> np.ndarray:
     I = np.eye(dim)  # noqa: E741
-    expected = (
+    return (
         lame * np.einsum("ij,kl->ijkl", I, I)
         + mu * np.einsum("ik,jl->ijkl", I, I)
         + mu * np.einsum("il,jk->ijkl", I, I)
     )
-    np.testing.assert_allclose(respond(I[None])[2][0], expected, atol=1e-14)
 
 
-def test_green_under_uniaxial_stretch_has_its_closed_form():
-    """E_11 = (s^2 - 1)/2 alone: P_11 = s (lambda + 2 mu) E_11, P_22 = lambda E_11."""
-    s, lame, mu = 1.7, 2.0, 0.6
-    W, P, _ = MATERIALS["green"](np.diag([s - 1.0, 0.0, 0.0])[None], np.array([lame]), np.array([mu]))
-    strain = (s * s - 1) / 2
-    np.testing.assert_allclose(P[0], np.diag([s * (lame + 2 * mu), lame, lame]) * strain, rtol=1e-14, atol=1e-15)
-    assert W[0] == pytest.approx((lame / 2 + mu) * strain**2, rel=1e-14)
+both_dimensions = pytest.mark.parametrize("dim", [2, 3])
+every_material = pytest.mark.parametrize("name", sorted(MATERIALS))
+
+
+@st.composite
+def gradients(draw, inverted: bool = False) -> np.ndarray:
+    """Draw F of either dimension: any at all, or one whose volume is positive and not next to nothing."""
+    dim = draw(st.sampled_from([2, 3]))
+    entries = st.floats(-2.0, 2.0) if inverted else st.floats(-0.7, 0.7)
+    rows = draw(st.lists(entries, min_size=dim * dim, max_size=dim * dim))
+    F = np.reshape(rows, (dim, dim)) + (0.0 if inverted else np.eye(dim))
+    assume(inverted or np.linalg.det(F) > 0.3)
+    return F
+
+
+def check_derivatives(name: str, F: np.ndarray) -> None:
+    _, P, C = respond(name, F)
+    size = max(np.abs(C).max(), MU)  # a stable element shrunk to a point has no stiffness at all
+    np.testing.assert_allclose(P, central_difference(lambda F: respond(name, F)[0], F), atol=1e-6 * size)
+    np.testing.assert_allclose(C, central_difference(lambda F: respond(name, F)[1], F), atol=1e-6 * size)
+    np.testing.assert_allclose(C, C.transpose(2, 3, 0, 1), atol=1e-13 * np.abs(C).max())
+
+
+@every_material
+@settings(max_examples=60, deadline=None)
+@given(F=gradients())
+def test_stress_and_symmetric_tangent_are_the_derivatives_of_energy(name, F):
+    check_derivatives(name, F)
+
+
+@pytest.mark.parametrize("name", INVERTIBLE)
+@settings(max_examples=60, deadline=None)
+@given(F=gradients(inverted=True))
+@example(F=np.zeros((3, 3)))
+@example(F=np.zeros((2, 2)))
+@example(F=np.diag([1.0, -1.0]))
+@example(F=-np.eye(3))
+@example(F=np.diag([2.0, 0.0, 1.0]))
+def test_so_they_are_of_inverted_and_flat_elements(name, F):
+    check_derivatives(name, F)
+
+
+@both_dimensions
+@every_material
+def test_without_a_tangent_energy_and_stress_are_the_same(name, dim):
+    H = deformations(dim, 5) - np.eye(dim)
+    lame, mu = np.full(5, LAME), np.full(5, MU)
+    with_tangent, without = MATERIALS[name](H, lame, mu), MATERIALS[name](H, lame, mu, tangent=False)
+    np.testing.assert_array_equal(without[0], with_tangent[0])
+    np.testing.assert_array_equal(without[1], with_tangent[1])
+    assert without[2].shape == (0, dim, dim, dim, dim)
+
+
+@both_dimensions
+@every_material
+def test_a_material_is_linear_in_its_parameters(name, dim):
+    F = deformations(dim)
+    for whole, volume, shape in zip(
+        respond(name, F), respond(name, F, mu=0.0), respond(name, F, lame=0.0), strict=True
+    ):
+        np.testing.assert_allclose(volume + shape, whole, atol=1e-13 * np.nanmax(np.abs(whole)))
+
+
+@both_dimensions
+@pytest.mark.parametrize("name", NONLINEAR)
+def test_energy_sees_no_rotation_and_stress_turns_with_it(name, dim):
+    F, R = deformations(dim), rotation(dim)
+    W, P, _ = respond(name, F)
+    turned_W, turned_P, _ = respond(name, R @ F)
+    np.testing.assert_allclose(turned_W, W, rtol=1e-11)
+    np.testing.assert_allclose(turned_P, R @ P, atol=1e-12 * np.abs(P).max())
+
+
+@both_dimensions
+@pytest.mark.parametrize("name", NONLINEAR)
+def test_a_rotation_costs_nothing(name, dim):
+    R = np.stack([rotation(dim, seed) for seed in range(50)])
+    W, P, _ = respond(name, R)
+    assert np.abs(W).max() < 1e-28
+    assert np.abs(P).max() < 1e-14
+
+
+@both_dimensions
+@every_material
+def test_at_rest_every_material_is_hookes(name, dim):
+    W, P, C = respond(name, np.eye(dim))
+    assert W == 0 and not P.any()
+    np.testing.assert_allclose(C, hooke(dim), atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-6, 1e-9, 1e-12])
+@both_dimensions
+@every_material
+def test_tiny_strains_keep_their_digits(name, dim, size):
+    """What is left of Hooke's energy and stress is the next order, whatever the strain: nothing drowns in F = I."""
+    H = size * np.random.default_rng(4).standard_normal((20, dim, dim))
+    W, P, _ = MATERIALS[name](H, np.full(20, LAME), np.full(20, MU))
+    stress = np.einsum("ijkl,nkl->nij", hooke(dim), H)
+    np.testing.assert_allclose(W, np.einsum("nij,nij->n", stress, H) / 2, rtol=40 * size + 1e-14)
+    np.testing.assert_allclose(P, stress, atol=np.abs(stress).max() * (40 * size + 1e-14))
+
+
+@pytest.mark.parametrize("material, state", [("green", "SVK"), ("neohookean", "NH")])
+@pytest.mark.parametrize("dim, place", [(3, "uniaxial3D"), (2, "planestrain")])
+@pytest.mark.parametrize("row", UNIAXIAL, ids=lambda row: f"{row['stretch']:g}")
+def test_uniaxial_stress_is_the_exact_one(material, state, dim, place, row):
+    """The width at which the sides bear no stress is found from the material's own stress."""
+    lame, mu = lame_parameters(1.0, 0.3)
+    stretch, wanted = row["stretch"], row[f"P_{state}_{place}"]
+
+    def stress(width):
+        return respond(material, np.diag([stretch, *[width] * (dim - 1)]), lame, mu)[1]
+
+    if np.isnan(row[f"lambda_t_{state}"]) or (dim == 2 and state == "SVK" and stretch > 1.8):
+        assert stress(1e-3)[1, 1] > 0  # so far stretched, no width frees St Venant-Kirchhoff's sides
+        return
+    width = brentq(lambda width: stress(width)[1, 1], 1e-3, 2.0, xtol=1e-15, rtol=1e-15)
+    assert stress(width)[0, 0] == pytest.approx(wanted, abs=1e-8)
+
+
+def test_a_neohookean_element_without_volume_is_no_number_and_no_warning():
+    for F in (np.diag([1.0, -0.5]), np.zeros((2, 2)), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)):
+        W, P, C = respond("neohookean", F)
+        assert np.isinf(W) and np.isnan(P).all() and np.isnan(C).all()
+
+
+def test_a_nearly_flat_neohookean_element_keeps_its_digits():
+    thin = 2.0**-40
+    W, P, _ = respond("neohookean", np.diag([1.0, thin]))
+    log_J = np.log(thin)
+    assert W == pytest.approx(MU / 2 * (thin**2 - 1) - MU * log_J + LAME / 2 * log_J**2, rel=1e-14)
+    assert P[1, 1] == pytest.approx(MU * thin + (LAME * log_J - MU) / thin, rel=1e-14)
+
+
+@both_dimensions
+def test_the_stable_material_has_no_rest_but_rotations(dim):
+    """A flat or collapsed element pushes, or has a way down: else it would never come back."""
+    flat = np.eye(dim)
+    flat[0, 0] = 0.0
+    assert np.abs(respond("stable-neohookean", flat)[1]).max() > 0.1 * MU
+    rng = np.random.default_rng(6)
+    at_the_point = respond("stable-neohookean", np.zeros((dim, dim)))[0]
+    nearby = respond("stable-neohookean", 1e-2 * np.stack([rotation(dim, s) for s in rng.integers(0, 99, 9)]))[0]
+    assert np.all(nearby < at_the_point)
+
+
+@both_dimensions
+@pytest.mark.parametrize("name", INVERTIBLE)
+def test_projection_removes_negative_eigenvalues_and_nothing_else(name, dim):
+    F = np.concatenate((deformations(dim, 50), np.random.default_rng(8).uniform(-2, 2, (50, dim, dim)), [np.eye(dim)]))
+    C = respond(name, F)[2]
+    P = C.copy()
+    project(P)
+    flat, exact = P.reshape(-1, dim**2, dim**2), C.reshape(-1, dim**2, dim**2)
+    values, vectors = np.linalg.eigh(exact)
+    expected = np.einsum("nij,nj,nkj->nik", vectors, np.maximum(values, 0), vectors)
+    size = np.abs(values).max(axis=1)[:, None, None]
+    np.testing.assert_allclose(flat / size, expected / size, atol=1e-13)
+    np.testing.assert_allclose(flat / size, flat.transpose(0, 2, 1) / size, atol=1e-14)
+    assert np.all(np.linalg.eigvalsh(flat) > -1e-13 * size[:, 0])
+    untouched = values[:, 0] > -1e-15 * size[:, 0, 0]
+    np.testing.assert_array_equal(flat[untouched], exact[untouched])
+    if name != "linear":
+        assert np.any(values[:, 0] < -1e-3 * size[:, 0, 0])
+
+
+def test_projection_leaves_what_is_no_number():
+    C = np.full((1, 2, 2, 2, 2), np.nan)
+    project(C)
+    assert np.isnan(C).all()
+
+
+def test_a_projected_material_differs_in_its_tangent_only():
+    H = np.random.default_rng(9).uniform(-2, 2, (20, 2, 2))
+    lame, mu = np.full(20, LAME), np.full(20, MU)
+    exact, clamped = MATERIALS["green"](H, lame, mu), projected(MATERIALS["green"])(H, lame, mu)
+    np.testing.assert_array_equal(clamped[0], exact[0])
+    np.testing.assert_array_equal(clamped[1], exact[1])
+    project(exact[2])
+    np.testing.assert_array_equal(clamped[2], exact[2])
+    assert projected(MATERIALS["green"])(H, lame, mu, tangent=False)[2].shape == (0, 2, 2, 2, 2)
+    assert projected(linear) is linear
 
 
 def test_lame_parameters_invert_to_young_and_poisson():

@@ -168,7 +168,12 @@ BROKEN = [
     (["fluid.sides.right.inflow.ramp=-1"], "fluid.sides.right.inflow.ramp = -1", "must be 0 or more (s"),
     (["solids.layer.poisson=0.5"], "solids.layer.poisson = 0.5", "must be less than 0.5"),
     (["solids.layer.young=0"], "solids.layer.young = 0", "must be greater than 0 (Pa)"),
-    (["solids.layer.material=jelly"], 'material = "jelly"', "must be 'green'"),
+    (
+        ["solids.layer.material=jelly"],
+        'material = "jelly"',
+        "must be 'green', 'neohookean', 'stable-neohookean' or 'linear'",
+    ),
+    (["solids.layer.tangent=soft"], 'tangent = "soft"', "must be 'exact' or 'projected' (projected: without"),
     (["solids.layer.interior=air"], 'interior = "air"', "must be 'fluid' or 'void'"),
     (["solids.layer.supports.0.fix=[]"], "solids.layer.supports.0.fix = []", "must not be empty"),
     (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "must be 'x', 'y' or 'z'"),

@@ -250,7 +250,10 @@ class Solid(Table):
     density: Annotated[Real, Field(gt=0, description="kg/m^3")]
     young: Annotated[Real, Field(gt=0, description="Pa")]
     poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
-    material: Literal["green"] = "green"
+    material: Literal["green", "neohookean", "stable-neohookean", "linear"] = "green"
+    tangent: Annotated[
+        Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
+    ] = "exact"
     mass: Literal["consistent", "lumped"] = "consistent"
     interior: Literal["fluid", "void"] = "fluid"
     damping: Damping = Damping()

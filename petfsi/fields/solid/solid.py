@@ -12,7 +12,7 @@ from petfsi.errors import InputError
 from petfsi.fields.base import Slab
 from petfsi.fields.solid.elements import Bodies, Elements
 from petfsi.fields.solid.field import NodalSolid
-from petfsi.fields.solid.materials import MATERIALS, lame_parameters
+from petfsi.fields.solid.materials import MATERIALS, Material, lame_parameters, projected
 from petfsi.fields.solid.partition import slab
 from petfsi.fields.solid.probes import Place, locate
 from petfsi.geometry.bodies import build_bodies
@@ -174,11 +174,16 @@ def _bodies(solids: Mapping[str, Solid]) -> Bodies:
         density=np.array([solid.density for solid in solids.values()]),
         lame=lame[:, 0],
         mu=lame[:, 1],
-        material=[MATERIALS[solid.material] for solid in solids.values()],
+        material=[_material(solid) for solid in solids.values()],
         lumped=np.array([solid.mass == "lumped" for solid in solids.values()]),
         mass_damping=np.array([solid.damping.mass for solid in solids.values()]),
         stiffness_damping=np.array([solid.damping.stiffness for solid in solids.values()]),
     )
+
+
+def _material(solid: Solid) -> Material:
+    material = MATERIALS[solid.material]
+    return projected(material) if solid.tangent == "projected" else material
 
 
 def _selection(unknowns: np.ndarray, chosen: np.ndarray, n_unknowns: int) -> csr_matrix:
