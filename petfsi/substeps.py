@@ -14,6 +14,8 @@ EVERY = 100
 TRAVEL = 0.02
 #: Sub-steps are this part of the stable step at most: it may shrink until it is found anew.
 MARGIN = 0.9
+#: A step that must be divided more often has blown up.
+MOST = 100_000
 
 
 class StableStep:
@@ -67,6 +69,8 @@ class StableStep:
             return 1
         self._find()
         if self._subcycles:
+            if not dt < MOST * self.limit:
+                raise SolveError(f"the solid has blown up: its stable step is {self.limit:.4g} s at t = {t:g} s")
             return max(1, math.ceil(dt / (MARGIN * self.limit)))
         if dt > self.limit:
             kind = InputError if t == 0 else SolveError

@@ -134,6 +134,18 @@ class Field(ABC):
         """Return the values (SI) at which ``block`` is the derivative: where Newton's method begins."""
         return self.unknown()
 
+    def round_off(self, x: np.ndarray) -> float:
+        """Return what ``block @ x - rhs`` cannot fall below, eps ||block|| ||x||, in the solver's units. Collective.
+
+        Parameters
+        ----------
+        x : ndarray, shape (layout.n_local,)
+            SI.
+        """
+        comm = self.block.comm.tompi4py()
+        length = float(np.sqrt(comm.allreduce(float(x @ x)))) / self.col_scale
+        return float(np.finfo(float).eps) * self.block.norm(PETSc.NormType.NORM_INFINITY) * length
+
     def relinearise(self, x: np.ndarray) -> bool:
         """Let ``assemble`` linearise about these values (SI) until ``accept``; return whether that changes anything.
 

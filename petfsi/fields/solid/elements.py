@@ -181,6 +181,35 @@ class Elements:
             damping, power = damping + lost, power + done
         return damping, power
 
+    @property
+    def constant(self):
+        from petfsi.fields.solid.materials import MATERIALS
+        return all(m is MATERIALS["linear"] for m in self.bodies.material)
+
+    def lumped_mass(self, n):
+        return np.repeat(self.uniform_load(n)[0][:, :1], self.dim, axis=1)
+
+    def forces(self, at, b):
+        f = np.zeros_like(at.displacement)
+        for begin, end, body in self.chunks():
+            _, P, C = self.respond(at.displacement, begin, end, body)
+            if at.shift.any():
+                P = P + np.einsum('eiJkL,ekL->eiJ', C, self.displacement_gradients(at.shift, begin, end))
+            g = self.volume[begin:end, None, None] * np.einsum('eiJ,eaJ->eai', P, self.gradients[begin:end])
+            np.subtract.at(f, self.cells[begin:end], g)
+        b[:] = f[:len(b)]
+
+    def stiffest(self, d, mass):
+        most = 0.0
+        nc = self.dim + 1
+        for begin, end, body in self.chunks():
+            _, P, C = self.respond(d, begin, end, body)
+            G = self.gradients[begin:end]
+            K = np.einsum('e,eaJ,eiJkL,ebL->eaibk', self.volume[begin:end], G, C, G).reshape(end-begin, nc*self.dim, -1)
+            m = self.bodies.density[body] * self.volume[begin:end] / nc
+            most = max(most, float((np.linalg.eigvalsh(K)[:, -1] / m).max()))
+        return most
+
     def uniform_load(self, n: int) -> np.ndarray:
         """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, dim), kg."""
         share = np.repeat(self.bodies.density[self.body] * self.volume / (self.dim + 1), self.dim + 1)

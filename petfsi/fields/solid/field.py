@@ -261,6 +261,13 @@ class NodalSolid(SolidField):
         stage = self._stage
         return self.unknown() if stage is None or stage.k == 0 else (-stage.shift / stage.k).ravel()
 
+    def round_off(self, x: np.ndarray) -> float:
+        """Return eps ||A|| (||w|| + ||d~|| / k): forces come from positions that were rounded, too. Collective."""
+        stage = self._stage
+        if stage is None or stage.k == 0:
+            return super().round_off(x)
+        return super().round_off(np.concatenate((x, stage.tangent_at.ravel() / stage.k)))
+
     def relinearise(self, x: np.ndarray) -> bool:
         """Take K and K' where w brings the nodes; nothing if the step has no K' or K' is always the same."""
         stage = self._stage
