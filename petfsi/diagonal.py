@@ -6,7 +6,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.newton import Restage
+from petfsi.newton import Restage, as_it_is
 from petfsi.solve import PREFIX, Outcome
 from petfsi.system import System
 
@@ -36,7 +36,7 @@ class DiagonalSolver:
         """Solve another system of the same field from now on."""
         self.system, self._diagonal = system, None
 
-    def solve(self, changed: bool, restage: Restage) -> Outcome:
+    def solve(self, changed: bool, restage: Restage = as_it_is) -> Outcome:
         """Solve for the system's solution; what is not finished is found by its speed."""
         if changed or self._diagonal is None:
             self.set_up()

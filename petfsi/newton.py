@@ -24,13 +24,18 @@ class LinearSolver(Protocol):
         """Follow the operator's new values. Collective."""
         ...
 
-    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
-        """Solve for x, from zero; return the iterations. Collective."""
+    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> tuple[int, dict[str, float]]:
+        """Solve for x, from zero; return iterations and residuals. Collective."""
         ...
 
 
 #: Makes the system that of these values of the fields (SI); returns whether the operator has changed. Collective.
 Restage = Callable[[list[np.ndarray]], bool]
+
+
+def as_it_is(values: list[np.ndarray]) -> bool:
+    """Restage a linear system: it is that of any values."""
+    return False
 
 
 def snes_type(prefix: str, static: bool) -> str:
@@ -62,14 +67,16 @@ class Newton:
     solver : LinearSolver
     prefix : str
         Of the options: ``prefix + "snes_..."``.
+    line_search : str
+        The ``snes_linesearch_type`` unless options give one.
     """
 
-    def __init__(self, system: System, solver: LinearSolver, prefix: str) -> None:
+    def __init__(self, system: System, solver: LinearSolver, prefix: str, line_search: str) -> None:
         self.system, self.solver = system, solver
         self._x = system.solution.duplicate()
         self._function = system.rhs.duplicate()
         self._at: np.ndarray | None = None  # the values that the system is that of
-        self._restage: Restage = lambda values: False
+        self._restage: Restage = as_it_is
         self._changed = False
         self._iterations = 0
         self.snes = snes = PETSc.SNES().create(system.comm)
@@ -83,25 +90,40 @@ class Newton:
         inner.setType(PETSc.KSP.Type.PREONLY)
         inner.getPC().setType(PETSc.PC.Type.PYTHON)
         inner.getPC().setPythonContext(_Correction(self))
-        snes.setFromOptions()
+        self._read_options(line_search)
         if snes.getType() != PETSc.SNES.Type.NEWTONLS:
             raise InputError(f"option -{prefix}snes_type: must be {' or '.join(KINDS)}")
         snes.setUp()
         self._reads_floor = not PETSc.Options(prefix).hasName("snes_atol")
+
+    def _read_options(self, line_search: str) -> None:
+        options, name = PETSc.Options(self.snes.getOptionsPrefix()), "snes_linesearch_type"
+        chosen = options.hasName(name)
+        if not chosen:
+            options.setValue(name, line_search)
+        self.snes.setFromOptions()
+        if not chosen:
+            options.delValue(name)
 
     def release(self) -> None:
         """Free what PETSc holds. Collective."""
         for thing in (self.snes, self._x, self._function):
             thing.destroy()
 
-    def solve(self, changed: bool, restage: Restage) -> tuple[int, int]:
-        """Solve for the system's solution; return the iterations and those of all linear solves. Collective.
+    def solve(self, changed: bool, restage: Restage) -> tuple[int, int, float]:
+        """Solve for the system's solution, and leave the system that of it. Collective.
 
         Parameters
         ----------
         changed : bool
             Whether the operator differs from that of the last call.
         restage : callable
+
+        Returns
+        -------
+        int, int, float
+            Iterations, those of all linear solves, and |b - K(x) x| over |b|; where no more than round-off is left,
+            over that of which it is the round-off.
 
         Raises
         ------
@@ -114,18 +136,20 @@ class Newton:
         for field in system.fields:
             self._x.array[system.piece(field.name)] = field.linearised_at() / field.col_scale
         self._at = self._x.array_r.copy()
+        floor = sum(f.round_off(x) for f, x in zip(system.fields, system.values(self._x), strict=True))
         if self._reads_floor:
-            values = zip(system.fields, system.values(self._x), strict=True)
-            snes.setTolerances(atol=sum(field.round_off(x) for field, x in values))
+            snes.setTolerances(atol=floor)
         try:
             snes.solve(None, self._x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{snes.getOptionsPrefix()}snes_' broke down: code {error.ierr}") from None
         self._become(self._x)
         system.solution.array = self._x.array_r
+        norms = system.update_residual()
         if snes.getConvergedReason() < 0:
-            raise SolveError(self._story())
-        return snes.getIterationNumber(), self._iterations
+            raise SolveError(self._story(norms))
+        scale = norms["rhs"] if norms[""] > floor else floor / np.finfo(float).eps
+        return snes.getIterationNumber(), self._iterations, float(norms[""] / scale) if scale > 0 else 0.0
 
     def _become(self, x: PETSc.Vec) -> None:
         """Make the system that of x, unless it is. Collective."""
@@ -148,11 +172,10 @@ class Newton:
             self.solver.set_up()
             self._changed = False
         y.set(0.0)
-        self._iterations += self.solver.solve_linear(f, y)
+        self._iterations += self.solver.solve_linear(f, y)[0]
 
-    def _story(self) -> str:
+    def _story(self, norms: dict[str, float]) -> str:
         system, snes = self.system, self.snes
-        norms = system.update_residual()
         rtol, atol = snes.getTolerances()[:2]
         by_field = ", ".join(f"{field.name} {norms[field.name]:.1e}" for field in system.fields)
         return (

@@ -11,9 +11,10 @@ from mpi4py import MPI
 
 from petfsi import build, petsc
 from petfsi.accounts import Accounts
+from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import SolveError
-from petfsi.fields.base import FluidField, Reader, Slab, SolidField
+from petfsi.fields.base import Field, FluidField, Reader, Slab, SolidField
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
@@ -139,7 +140,8 @@ class Simulation:
 
     def _rewind(self) -> None:
         """Put everything back to before the step that has failed; nothing of it was accepted. Collective."""
-        for part in (*self.fields, *self.couplings):
+        parts: list[Field | Coupling] = [*self.fields, *self.couplings]
+        for part in parts:
             part.rewind()
         if self.regions:
             self.regions.rewind()
@@ -182,7 +184,8 @@ class Simulation:
         # not any(): every field must hear
         if not sum([field.relinearise(x) for field, x in zip(self.fields, values, strict=True)]):
             return False
-        for part in (*self.fields, *self.couplings):
+        parts: list[Field | Coupling] = [*self.fields, *self.couplings]
+        for part in parts:
             part.assemble(t, dt)
         return self.system.refresh(guess=False)
 

@@ -16,7 +16,7 @@ from petfsi import petsc
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import FluidField
 from petfsi.multigrid import Hierarchy
-from petfsi.newton import Newton, Restage, snes_type
+from petfsi.newton import Newton, Restage, as_it_is, snes_type
 from petfsi.pressure_solver import PressureSolver
 from petfsi.system import System
 
@@ -147,6 +147,7 @@ class Solver:
 
     def __init__(self, system: System, static: bool = False) -> None:
         self.system = system
+        self._static = static
         self.iterates = snes_type(PREFIX, static) != "ksponly"
         single = len(system.fields) == 1
         splits = PETSc.Options(PREFIX).getString("pc_type", "") == PETSc.PC.Type.FIELDSPLIT
@@ -166,7 +167,6 @@ class Solver:
         self._hierarchy: Hierarchy | None = None
         self._newton: Newton | None = None
         self._inner_iterations = 0
-        self._norms: dict[str, float] = {}
 
     def set_up(self) -> None:
         """Create the KSP if there is none and let everything inside it read its options. Collective."""
@@ -247,7 +247,7 @@ class Solver:
         self.reset()
         self.system, self._monolith = system, None
 
-    def solve(self, changed: bool, restage: Restage) -> Outcome:
+    def solve(self, changed: bool, restage: Restage = as_it_is) -> Outcome:
         """Solve for the system's solution, from its first guess. Collective.
 
         Parameters
@@ -264,21 +264,28 @@ class Solver:
         """
         changed = changed or self._ksp is None
         if self.iterates:
-            newton, iterations = self._iteration().solve(changed, restage)
-        else:
-            if changed:
+            if self._ksp is None:
                 self.set_up()
-            newton, iterations = 0, self.solve_linear(self.system.rhs, self.system.solution)
-        norms = self.system.update_residual() if self.iterates else self._norms
-        return Outcome(iterations, norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0, newton)
+            newton, iterations, residual = self._iteration().solve(changed, restage)
+            return Outcome(iterations, residual, newton)
+        if changed:
+            self.set_up()
+        iterations, norms = self.solve_linear(self.system.rhs, self.system.solution)
+        return Outcome(iterations, norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0)
 
     def _iteration(self) -> Newton:
         if self._newton is None:
-            self._newton = Newton(self.system, self, PREFIX)
+            # full steps nearly always do where there is inertia; in statics the residual often has to grow first
+            self._newton = Newton(self.system, self, PREFIX, "l2" if self._static else "bt")
         return self._newton
 
-    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
-        """Solve for x, from what it holds, with the operator as it was set up; return the iterations. Collective.
+    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> tuple[int, dict[str, float]]:
+        """Solve for x, from what it holds, with the operator as it was set up. Collective.
+
+        Returns
+        -------
+        int, dict of str to float
+            Iterations, and the residual's norms (see ``System.update_residual``).
 
         Raises
         ------
@@ -294,9 +301,9 @@ class Solver:
             ksp.solve(b, x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{self.prefix}' broke down: {_petsc_text(error)}") from None
-        self._norms = self.system.update_residual(x, b)
-        self._judge(ksp, self._norms)
-        return max(self._inner_iterations, ksp.getIterationNumber())
+        norms = self.system.update_residual(x, b)
+        self._judge(ksp, norms)
+        return max(self._inner_iterations, ksp.getIterationNumber()), norms
 
     def _judge(self, ksp: PETSc.KSP, norms: dict[str, float]) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""

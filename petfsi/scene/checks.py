@@ -36,8 +36,8 @@ SOLID_QUANTITIES = ("displacement", "velocity")
 NO_Z = "bounds z, which dim = 2 does not have"
 #: Columns of history.csv, which a probe must not repeat.
 RESERVED_PROBES = (
-    "step", "time", "dt", "iterations", "residual", "newton", "substeps", "volume_error", "divergence", "region_volume", "momentum",
-    "kinetic", "elastic", "potential", "dissipated", "boundary_work", "energy_residual",
+    "step", "time", "dt", "iterations", "residual", "newton", "substeps", "volume_error", "divergence",
+    "region_volume", "momentum", "kinetic", "elastic", "potential", "dissipated", "boundary_work", "energy_residual",
 )  # fmt: skip
 
 

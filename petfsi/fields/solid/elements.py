@@ -184,6 +184,7 @@ class Elements:
     @property
     def constant(self):
         from petfsi.fields.solid.materials import MATERIALS
+
         return all(m is MATERIALS["linear"] for m in self.bodies.material)
 
     def lumped_mass(self, n):
@@ -194,10 +195,10 @@ class Elements:
         for begin, end, body in self.chunks():
             _, P, C = self.respond(at.displacement, begin, end, body)
             if at.shift.any():
-                P = P + np.einsum('eiJkL,ekL->eiJ', C, self.displacement_gradients(at.shift, begin, end))
-            g = self.volume[begin:end, None, None] * np.einsum('eiJ,eaJ->eai', P, self.gradients[begin:end])
+                P = P + np.einsum("eiJkL,ekL->eiJ", C, self.displacement_gradients(at.shift, begin, end))
+            g = self.volume[begin:end, None, None] * np.einsum("eiJ,eaJ->eai", P, self.gradients[begin:end])
             np.subtract.at(f, self.cells[begin:end], g)
-        b[:] = f[:len(b)]
+        b[:] = f[: len(b)]
 
     def stiffest(self, d, mass):
         most = 0.0
@@ -205,7 +206,9 @@ class Elements:
         for begin, end, body in self.chunks():
             _, P, C = self.respond(d, begin, end, body)
             G = self.gradients[begin:end]
-            K = np.einsum('e,eaJ,eiJkL,ebL->eaibk', self.volume[begin:end], G, C, G).reshape(end-begin, nc*self.dim, -1)
+            K = np.einsum("e,eaJ,eiJkL,ebL->eaibk", self.volume[begin:end], G, C, G).reshape(
+                end - begin, nc * self.dim, -1
+            )
             m = self.bodies.density[body] * self.volume[begin:end] / nc
             most = max(most, float((np.linalg.eigvalsh(K)[:, -1] / m).max()))
         return most
