@@ -94,6 +94,7 @@ class Newton:
         if snes.getType() != PETSc.SNES.Type.NEWTONLS:
             raise InputError(f"option -{prefix}snes_type: must be {' or '.join(KINDS)}")
         snes.setUp()
+        snes.setUpdate(self._aim)
         self._reads_floor = not PETSc.Options(prefix).hasName("snes_atol")
 
     def _read_options(self, line_search: str) -> None:
@@ -136,20 +137,28 @@ class Newton:
         for field in system.fields:
             self._x.array[system.piece(field.name)] = field.linearised_at() / field.col_scale
         self._at = self._x.array_r.copy()
-        floor = sum(f.round_off(x) for f, x in zip(system.fields, system.values(self._x), strict=True))
         if self._reads_floor:
-            snes.setTolerances(atol=floor)
+            snes.setTolerances(atol=self._floor(self._x))
         try:
             snes.solve(None, self._x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{snes.getOptionsPrefix()}snes_' broke down: code {error.ierr}") from None
         self._become(self._x)
         system.solution.array = self._x.array_r
-        norms = system.update_residual()
-        if snes.getConvergedReason() < 0:
+        norms, floor = system.update_residual(), self._floor(self._x)
+        if snes.getConvergedReason() < 0 and not norms[""] <= floor:
             raise SolveError(self._story(norms))
         scale = norms["rhs"] if norms[""] > floor else floor / np.finfo(float).eps
         return snes.getIterationNumber(), self._iterations, float(norms[""] / scale) if scale > 0 else 0.0
+
+    def _floor(self, x: PETSc.Vec) -> float:
+        """Return the norm of the function that is round-off at x. Collective."""
+        return sum(field.round_off(part) for field, part in zip(self.system.fields, self.system.values(x), strict=True))
+
+    def _aim(self, snes: PETSc.SNES, _step: int) -> None:
+        """Ask for no less than round-off, which grows with the way. Collective."""
+        if self._reads_floor:
+            snes.setTolerances(atol=self._floor(snes.getSolution()))
 
     def _become(self, x: PETSc.Vec) -> None:
         """Make the system that of x, unless it is. Collective."""

@@ -161,6 +161,11 @@ class Solver:
         self.decoupled = not single and splits and split != "schur"
         # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
         self.fixed_iterations = options.getString("ksp_convergence_test", "default") == "skip"
+        if self.fixed_iterations and self.iterates:
+            raise InputError(
+                f"option -{PREFIX}snes_type newtonls: wants linear systems solved, and -{self.prefix}"
+                f"ksp_convergence_test skip takes a fixed number of iterations; try split-iterated.opts"
+            )
         self._ksp: PETSc.KSP | None = None
         self._monolith: PETSc.Mat | None = None
         self._pressure: PressureSolver | None = None
