@@ -31,6 +31,34 @@ _FACET_TYPE = {2: "line", 3: "triangle"}
 
 
 @dataclass(frozen=True)
+class Group:
+    """Elements of one body and one kind.
+
+    Attributes
+    ----------
+    body : int
+    nodes : ndarray of int, shape (ne, n)
+        Of each element; its first dim + 1 are its corners, unless it is a patch.
+    gradients : ndarray, shape (ne, n, dim), or None
+        Of a patch, several elements with one gradient: the mean gradients of its nodes' shape functions, 1/m. Patches
+        of fewer nodes repeat one, with gradient zero.
+    volume : ndarray, shape (ne,), or None
+        Of a patch, m^3.
+    """
+
+    body: int
+    nodes: np.ndarray
+    gradients: np.ndarray | None = None
+    volume: np.ndarray | None = None
+
+    def take(self, chosen: np.ndarray) -> Group:
+        """Return some of the elements."""
+        gradients = None if self.gradients is None else self.gradients[chosen]
+        volume = None if self.volume is None else self.volume[chosen]
+        return Group(self.body, self.nodes[chosen], gradients, volume)
+
+
+@dataclass(frozen=True)
 class SimplexMesh:
     """Triangles or tetrahedra of one or more bodies, positively oriented.
 
@@ -39,13 +67,17 @@ class SimplexMesh:
     points : ndarray, shape (n, dim)
         m; each body has its own.
     cells : ndarray of int, shape (ne, dim + 1)
+        Linear simplices: what surfaces, files and pictures see.
     body : ndarray of int, shape (ne,)
         The body each cell belongs to.
+    groups : tuple of Group
+        What forces come from; without any, the cells.
     """
 
     points: np.ndarray
     cells: np.ndarray
     body: np.ndarray
+    groups: tuple[Group, ...] = ()
 
     @classmethod
     def union(cls, meshes: list[tuple[np.ndarray, np.ndarray]]) -> SimplexMesh:

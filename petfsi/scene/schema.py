@@ -258,6 +258,10 @@ class Solid(Table):
     tangent: Annotated[
         Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
     ] = "exact"
+    elements: Annotated[Literal["linear", "quadratic"], Field(description="order of the shape functions")] = "linear"
+    volumetric: Annotated[
+        Literal["full", "reduced"], Field(description="integration of lambda's part; reduced does not lock")
+    ] = "full"
     mass: Literal["consistent", "lumped"] = "consistent"
     interior: Literal["fluid", "void"] = "fluid"
     damping: Damping = Damping()
