@@ -117,7 +117,8 @@ class Simulation:
         except SolveError as error:
             if retries == 0:
                 raise
-            self.report(f"t = {t:.6g} s: a step of {dt:g} s is taken again as two halves: {error}")
+            why = str(error).split(": ")[0]
+            self.report(f"t = {t:.6g} s: the step of {dt:g} s is taken again as two halves: {why}")
             self._rewind()
             self._take(t, dt / 2, retries - 1)
             self._take(t + dt / 2, dt / 2, retries - 1)
