@@ -212,7 +212,7 @@ class _Tangent:
         self._facets, self._n, dim = facets, mesh.n_owned, facets.dim
         nodes = facets.nodes
         unknowns = dim * mesh.number[nodes].astype(np.int64)[:, :, None] + np.arange(dim)
-        unknowns = unknowns.reshape(len(nodes), -1)
+        unknowns = unknowns.reshape(len(nodes), dim * nodes.shape[1])
         row = np.repeat(unknowns - dim * mesh.nodes.start, unknowns.shape[1], axis=1).ravel()
         column = np.tile(unknowns, (1, unknowns.shape[1])).ravel()
         self._chosen = np.repeat(np.repeat(nodes < self._n, dim, axis=1), unknowns.shape[1], axis=1).ravel()
