@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +70,40 @@ def set_csr(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, values: np.
     if new_pattern:
         mat.setPreallocationCSR((indptr, indices, values))
     else:
-        mat.setValuesCSR(indptr, indices, values)
-        mat.assemble()
+        _replace_values(mat, indices, values)
+
+
+def _replace_values(mat: PETSc.Mat, indices: np.ndarray, values: np.ndarray) -> None:
+    """Write all entries of this rank's rows into an AIJ matrix; row by row, PETSc's way, takes ten times as long.
+
+    On several ranks PETSc keeps the columns that this rank owns apart from the others, each in the order of the rows.
+    """
+    values = np.ascontiguousarray(values, dtype=float)
+    if mat.getType() == PETSc.Mat.Type.MPIAIJ:
+        call = _library().MatMPIAIJGetSeqAIJ
+        own, others, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
+        call.argtypes = [ctypes.c_void_p, *(ctypes.POINTER(ctypes.c_void_p),) * 3]
+        if call(mat.handle, ctypes.byref(own), ctypes.byref(others), ctypes.byref(columns)):
+            raise PETSc.Error
+        begin, end = mat.getOwnershipRangeColumn()
+        mine = (indices >= begin) & (indices < end)
+        _overwrite(own, values[mine])
+        _overwrite(others, values[~mine])
+    else:
+        _overwrite(ctypes.c_void_p(mat.handle), values)
+    mat.assemble()
+
+
+def _overwrite(mat: ctypes.c_void_p, values: np.ndarray) -> None:
+    """Replace the entries of a matrix of one rank, in PETSc's own array."""
+    place = ctypes.c_void_p()
+    for function, work in (("MatSeqAIJGetArray", True), ("MatSeqAIJRestoreArray", False)):
+        call = getattr(_library(), function)
+        call.argtypes = [ctypes.c_void_p, ctypes.POINTER(ctypes.c_void_p)]
+        if call(mat, ctypes.byref(place)):
+            raise PETSc.Error
+        if work:
+            ctypes.memmove(place, values.ctypes.data, values.nbytes)
 
 
 def collect_garbage() -> None:
@@ -129,6 +162,7 @@ def gather_triplets(
 # ---- options ------------------------------------------------------------------------------------------------
 
 
+@cache
 def _library() -> ctypes.CDLL:
     """Return the libpetsc that this process runs; loading a second one by name would crash."""
     maps = Path("/proc/self/maps").read_text().split()

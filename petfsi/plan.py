@@ -16,8 +16,10 @@ from petfsi.errors import InputError
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 
-#: The options file in force when none is named.
-DEFAULT_OPTIONS = "monolithic.opts"
+#: The options file in force when none is named, and that of large solids alone.
+DEFAULT_OPTIONS, LARGE_OPTIONS = "monolithic.opts", "solid-large.opts"
+#: Beyond so many unknowns of a solid in 3D multigrid is faster than a factorisation, and needs less memory.
+LARGE = 50_000
 #: Steps of changing length are counted up to here.
 MAX_COUNTED = 100_000
 #: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.
@@ -53,8 +55,26 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
     nodes, cells = _solid_sizes(scene)
     lines = [scene.title or "untitled", ""]
     lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, nodes, cells)]
-    lines += [f"{'options:':<13}{_options(scene, petsc_options)}", "", "skipped:"]
+    lines += [f"{'options:':<13}{_options(scene, nodes, petsc_options)}", "", "skipped:"]
     return "\n".join([*lines, *(f"  {line}" for line in skipped(scene))])
+
+
+def default_options(scene: Scene) -> str:
+    """Return the name of the options file in force when none is named. Not collective.
+
+    Raises
+    ------
+    InputError
+        With every mistake in the meshes of a scene of solids alone in 3D: they are built to be counted.
+    """
+    if scene.fluid is not None or scene.dim == 2:
+        return DEFAULT_OPTIONS
+    return _default_options(scene, _solid_sizes(scene)[0])
+
+
+def _default_options(scene: Scene, nodes: dict[str, int]) -> str:
+    large = scene.fluid is None and scene.dim == 3 and scene.dim * sum(nodes.values()) > LARGE
+    return LARGE_OPTIONS if large else DEFAULT_OPTIONS
 
 
 def skipped(scene: Scene) -> list[str]:
@@ -89,7 +109,7 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
         unknowns += n
         rows.append(("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, scene.fluid.cells))}"))
     if nodes:
-        n = scene.dim * sum(nodes.values())
+        n = sum(count * (scene.dim if scene.solids[name].shape.beam is None else 3) for name, count in nodes.items())
         unknowns += n
         bodies = "; ".join(f"{name} {nodes[name]:,} nodes, {cells[name]:,} cells" for name in nodes)
         rows.append(("solid", f"{n:,} unknowns ({bodies})"))
@@ -129,6 +149,7 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     if len(boxes) == len(scene.solids) and not scene.obstacles:
         nodes = {name: math.prod(n + 1 for n in box) for name, box in boxes.items()}
         return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
+    from petfsi.geometry.beams import axis_mesh
     from petfsi.geometry.bodies import build_bodies
     from petfsi.geometry.meshes import read_surface
     from petfsi.geometry.obstacles import obstacle_surfaces
@@ -148,6 +169,8 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
             errors += [line for line in str(error).splitlines() if line not in errors]
     if errors:
         raise InputError("\n".join(errors))
+    beams = {name: solid.shape.beam for name, solid in scene.solids.items() if solid.shape.beam is not None}
+    meshes |= {name: axis_mesh(beam) for name, beam in beams.items()}
     return {n: len(points) for n, (points, _) in meshes.items()}, {n: len(cells) for n, (_, cells) in meshes.items()}
 
 
@@ -190,13 +213,14 @@ def _bytes(count: float) -> str:
     return f"{count:.3g} TB"
 
 
-def _options(scene: Scene, petsc_options: Sequence[str]) -> str:
+def _options(scene: Scene, nodes: dict[str, int], petsc_options: Sequence[str]) -> str:
     files = [value for name, value in zip(petsc_options, petsc_options[1:], strict=False) if name == "-options_file"]
-    chosen = ", ".join(files) or f"{DEFAULT_OPTIONS} (the default)"
+    chosen = ", ".join(files) or f"{_default_options(scene, nodes)} (the default)"
     words = " ".join(petsc_options)
     for name in files:
         words = words.replace(f"-options_file {name}", "")
-    coupled = "" if scene.fluid is not None and scene.solids else "; of it, what the single field reads"
+    whole = (scene.fluid is not None and scene.solids) or chosen.startswith(LARGE_OPTIONS)
+    coupled = "" if whole else "; of it, what the single field reads"
     return chosen + coupled + (f"; over it {' '.join(words.split())}" if words.split() else "")
 
 

@@ -22,7 +22,7 @@ from petfsi.output.history import History, column_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
-from petfsi.plan import MAX_COUNTED, skipped
+from petfsi.plan import MAX_COUNTED, default_options, skipped
 from petfsi.ranks import on_root
 from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
@@ -263,7 +263,7 @@ def run_scene(
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
-    solve.load_options(petsc_args)
+    solve.load_options(petsc_args, base=Path(on_root(comm, lambda: default_options(scene))))
     simulation = Simulation(comm, scene)
     unread = simulation.prepare()
     files = RunDirectory.create(out, dump_scene(scene), solve.dump_options(), overwrite, comm)

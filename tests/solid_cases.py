@@ -7,10 +7,11 @@ from petsc4py import PETSc
 from petfsi.fields.solid import SimplexSolid
 from petfsi.fields.solid.elements import Bodies, Elements, State
 from petfsi.fields.solid.materials import MATERIALS, lame_parameters
-from petfsi.fields.solid.partition import LocalMesh
+from petfsi.fields.solid.partition import distribute
+from petfsi.fields.solid.patches import grid_patches, grouped_mesh
 from petfsi.fields.solid.pattern import Pattern
-from petfsi.geometry.meshes import box_mesh
-from petfsi.petsc import Layout
+from petfsi.geometry.meshes import SimplexMesh, box_mesh
+from petfsi.geometry.quadratic import with_middles
 from petfsi.scene.schema import Box, Scene
 
 DENSITY, YOUNG, POISSON = 1.3, 20.0, 0.3
@@ -112,22 +113,36 @@ def bent_mesh(dim, n=3):
     return points, cells.astype(np.int32), inner
 
 
-def elements_of(points, cells):
+def whole_mesh(mesh):
+    """Return a mesh of one body as the piece of the only rank."""
+    return distribute(MPI.COMM_SELF, mesh)[0]
+
+
+def simplices(points, cells, order="linear", volumetric="full"):
+    """Return the mesh of one body; patches are those of a box, if its simplices are whole cells of a grid."""
+    dim, patch = points.shape[1], None
+    if order == "quadratic":
+        points, cells = with_middles(points, cells)
+    elif volumetric == "reduced":
+        patch = grid_patches(cells, dim)
+    return whole_mesh(grouped_mesh([(points, cells, patch)]))
+
+
+def elements_of(mesh, material="green", lame=LAME, mu=MU, lumped=False, volumetric="full"):
     one = np.ones(1)
-    bodies = Bodies(
-        DENSITY * one, LAME * one, MU * one, [MATERIALS["green"]], np.zeros(1, dtype=bool), 0 * one, 0 * one
-    )
-    return Elements(points, cells, np.zeros(len(cells), dtype=np.int32), bodies)
+    flag = one.astype(bool)
+    return Elements(mesh, Bodies(DENSITY * one, lame * one, mu * one, [MATERIALS[material]], flag & lumped,
+                                 flag & (volumetric == "reduced"), 0 * one, 0 * one))  # fmt: skip
 
 
-def pattern_of(points, cells):
-    n = len(points)
-    everything = np.arange(n)
-    return Pattern.of(
-        LocalMesh(points, cells, np.zeros(len(cells), np.int32), np.arange(len(cells)), np.ones(len(cells), bool),
-                  everything.astype(np.int32), everything, Layout(n, 0, n)),
-        points.shape[1],
-    )  # fmt: skip
+def pattern_of(mesh):
+    return Pattern.of(mesh, mesh.points.shape[1])
+
+
+def pattern_at(cells, n, width):
+    """Return the pattern of a mesh of ``n`` nodes on one rank."""
+    mesh = SimplexMesh(np.zeros((n, 2)), cells, np.zeros(len(cells), np.int32))
+    return Pattern.of(whole_mesh(mesh), width)
 
 
 def respond(elements, pattern, d, inertia=None, shift=None, a=0.0, k=1.0):

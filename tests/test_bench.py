@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import bench, cli
-from petfsi.bench import case, report, stability, theory
+from petfsi.bench import case, report, solid_speed, stability, theory
 from petfsi.errors import InputError
 
 
@@ -50,6 +50,15 @@ def test_what_a_step_does_to_a_mode_is_as_stated(scheme, lag, damping):
     seen = theory.observed(scheme, 1.0, 0.01)
     assert seen[1] == pytest.approx(damping, rel=1e-3, abs=1e-12)
     assert 1 - seen[0] == pytest.approx(lag * 1e-4, rel=1e-3)
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_cube_is_assembled_and_solved_for_the_stopwatch():
+    done = solid_speed.assembly(MPI.COMM_WORLD, "neohookean", (2, 2, 2))
+    assert (done["tets"], done["nodes"]) == (48, 27) and done["ratio"] > 0
+    with case.only_options(["-options_file", "solid-large.opts"]):
+        row = solid_speed.step(MPI.COMM_WORLD, 6)
+    assert row["reason"] == "CONVERGED_RTOL" and 5 < row["iterations"] < 40
 
 
 def test_a_scheme_without_theory_is_told():

@@ -13,7 +13,7 @@ from processes import environment, launcher
 from petfsi import __version__, cli
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
-from petfsi.plan import DEFAULT_OPTIONS, describe_plan, skipped
+from petfsi.plan import DEFAULT_OPTIONS, default_options, describe_plan, skipped
 from petfsi.scene.load import scene_from_dict
 
 SCENE = """
@@ -268,6 +268,15 @@ def test_the_plan_counts_what_is_solved():
 def test_the_plan_says_which_options_apply():
     text = describe_plan(plan_scene(), ["-fsi_ksp_rtol", "1e-6", "-options_file", "split.opts", "-log_view"])
     assert "options:     split.opts; over it -fsi_ksp_rtol 1e-6 -log_view\n" in text
+
+
+@pytest.mark.parametrize("cells, named", [(24, "monolithic.opts"), (26, "solid-large.opts")])
+def test_a_large_solid_alone_is_solved_by_multigrid(cells, named):
+    box = {"origin": [0.0, 0.0, 0.0], "size": [1.0, 1.0, 1.0], "cells": [cells] * 3}
+    block = {"shape": {"box": box}, "density": 1.0, "young": 1.0, "poisson": 0.0}
+    scene = scene_from_dict({"dim": 3, "time": {"end": 1.0, "dt": 0.1}, "solids": {"block": block}})
+    assert default_options(scene) == named
+    assert f"options:     {named} (the default)" in describe_plan(scene)
 
 
 def test_the_plan_counts_the_nodes_of_meshes_as_they_are_built(tmp_path):

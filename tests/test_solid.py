@@ -19,6 +19,7 @@ from solid_cases import (
     gathered,
     pattern_of,
     respond,
+    simplices,
     step,
     wave,
 )
@@ -41,20 +42,22 @@ def dim(request):
 
 def test_patch_a_linear_displacement_loads_no_inner_node(dim):
     points, cells, inner = bent_mesh(dim)
+    mesh = simplices(points, cells)
     F = np.eye(dim) + wave(dim, dim, size=0.3)
-    _, b = respond(elements_of(points, cells), pattern_of(points, cells), points @ (F - np.eye(dim)).T)
+    _, b = respond(elements_of(mesh), pattern_of(mesh), points @ (F - np.eye(dim)).T)
     assert np.abs(b[~inner]).max() > 0.1
     assert np.abs(b[inner]).max() < 1e-13 * np.abs(b).max()
 
 
 def test_a_rigid_motion_costs_nothing(dim):
     points, cells, _ = bent_mesh(dim)
+    mesh = simplices(points, cells)
     angle = 1.1
     R = np.eye(dim)
     R[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     d = points @ (R - np.eye(dim)).T + 3.0
-    elements = elements_of(points, cells)
-    A, b = respond(elements, pattern_of(points, cells), d)
+    elements = elements_of(mesh)
+    A, b = respond(elements, pattern_of(mesh), d)
     assert np.abs(b).max() < 1e-13 * np.abs(A).max()
     assert elements.energies(d, 0 * d, np.ones(len(cells), dtype=bool))[1] < 1e-28 * YOUNG
     # and the turned body answers no rigid motion on top
@@ -66,7 +69,8 @@ def test_a_rigid_motion_costs_nothing(dim):
 
 def test_force_is_the_derivative_of_energy_and_tangent_of_force(dim):
     points, cells, _ = bent_mesh(dim, n=2)
-    elements, pattern = elements_of(points, cells), pattern_of(points, cells)
+    mesh = simplices(points, cells)
+    elements, pattern = elements_of(mesh), pattern_of(mesh)
     d, direction = wave(len(points), dim), wave(len(points), dim, seed=9, size=1.0)
     A, b = respond(elements, pattern, d)
     h = 1e-6
@@ -81,11 +85,12 @@ def test_force_is_the_derivative_of_energy_and_tangent_of_force(dim):
 
 def test_matrix_and_right_hand_side_are_those_of_the_slow_statement(dim):
     points, cells, _ = bent_mesh(dim, n=2)
+    mesh = simplices(points, cells)
     slow = Slow(points, cells)
     d, inertia, shift = (wave(len(points), dim, seed=seed) for seed in (3, 4, 5))
-    elements = elements_of(points, cells)
+    elements = elements_of(mesh)
     elements.bodies.mass_damping[:], elements.bodies.stiffness_damping[:] = 0.4, 0.1
-    A, b = respond(elements, pattern_of(points, cells), d, inertia, shift, a=2.0, k=0.3)
+    A, b = respond(elements, pattern_of(mesh), d, inertia, shift, a=2.0, k=0.3)
     K = slow.tangent(d)
     expected = 2.4 * slow.M + 0.4 * K
     np.testing.assert_allclose(A, expected, atol=1e-13 * np.abs(expected).max())
@@ -95,9 +100,10 @@ def test_matrix_and_right_hand_side_are_those_of_the_slow_statement(dim):
 
 def test_more_elements_than_a_chunk_give_the_same_as_one_by_one():
     points, cells, _ = bent_mesh(3, n=5)
+    mesh = simplices(points, cells)
     assert len(cells) > CHUNK
     d = wave(len(points), 3, size=0.01)
-    _, b = respond(elements_of(points, cells), pattern_of(points, cells), d)
+    _, b = respond(elements_of(mesh), pattern_of(mesh), d)
     np.testing.assert_allclose(b, -Slow(points, cells).force(d), atol=1e-13)
 
 
@@ -271,9 +277,9 @@ def test_a_bar_swings_axially_at_its_closed_form_frequency():
     length, young, errors = 2.0, 100.0, []
     for n in (8, 16, 32):
         points, cells = box_mesh(Box(origin=[0, 0], size=[length, length / n], cells=[n, 1]))
-        elements = elements_of(points, cells.astype(np.int32))
-        elements.bodies.lame[:], elements.bodies.mu[:] = lame_parameters(young, 0.0)
-        pattern, rest = pattern_of(points, cells.astype(np.int32)), np.zeros_like(points)
+        mesh = simplices(points, cells)
+        elements = elements_of(mesh, "green", *lame_parameters(young, 0.0))
+        pattern, rest = pattern_of(mesh), np.zeros_like(points)
         M = respond(elements, pattern, rest, a=1.0, k=0.0)[0]
         K = respond(elements, pattern, rest)[0]
         axial = np.flatnonzero(np.column_stack((points[:, 0] > 0, np.zeros(len(points), dtype=bool))).ravel())

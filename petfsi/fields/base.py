@@ -202,12 +202,15 @@ class SolidField(Field):
 
     Attributes
     ----------
+    width : int
+        Unknowns a node; the first ones are velocities along the axes.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
         By how much this rank's nodes moved in the step last accepted, m.
     """
 
+    width: int
     extent: float
     moved: np.ndarray
 
@@ -224,7 +227,7 @@ class SolidField(Field):
 
     @abstractmethod
     def surface(self) -> Surface:
-        """Return the wet surface, the same on every rank."""
+        """Return the wet surface, the same on every rank; another object where its maps have changed. Collective."""
 
     @abstractmethod
     def surface_positions(self) -> np.ndarray:

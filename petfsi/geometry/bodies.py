@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from petfsi.errors import InputError
+from petfsi.geometry.beams import axis_mesh
 from petfsi.geometry.meshes import build_mesh, read_surface
 from petfsi.geometry.places import Tags, located, located_facets, read_tags
 from petfsi.geometry.shapes import inside
@@ -57,7 +58,7 @@ def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
     mistakes = []
     for n, support in enumerate(solid.supports):
         try:
-            located(support.where, points, f"{key}.supports.{n}", tags)
+            located(support.where, _held_points(solid, points), f"{key}.supports.{n}", tags)
         except InputError as error:
             mistakes.append(str(error))
     facets = boundary_facets(points, cells) if solid.loads else cells[:0, :-1]
@@ -68,6 +69,11 @@ def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
         except InputError as error:
             mistakes.append(str(error))
     return mistakes
+
+
+def _held_points(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Return what supports hold: the points of a mesh, of a beam those of its axis."""
+    return points if solid.shape.beam is None else axis_mesh(solid.shape.beam)[0]
 
 
 # ---- apart from each other ----------------------------------------------------------------------------------
@@ -97,13 +103,15 @@ def _in_obstacles(scene: Scene, meshes: dict[str, Mesh], clamped: dict[str, np.n
 
 
 def _clamped(solid: Solid, points: np.ndarray, tags: Tags) -> np.ndarray:
-    """Return which nodes are held on all axes, as those in a wall are."""
-    held = np.zeros(points.shape, dtype=bool)
+    """Return which points are held on all axes (of a beam those at nodes that do not turn either), as in a wall."""
+    components = "xyz"[: points.shape[1]] if solid.shape.beam is None else ("x", "y", "angle")
+    nodes = _held_points(solid, points)
+    held = np.zeros((len(nodes), len(components)), dtype=bool)
     for support in solid.supports:
-        where = located(support.where, points, "supports", tags)
-        for axis in support.fix:
-            held[where, "xyz".index(axis)] = True
-    return held.all(axis=1)
+        where = located(support.where, nodes, "supports", tags)
+        for component in support.fix:
+            held[where, components.index(component)] = True
+    return np.repeat(held.all(axis=1), len(points) // len(nodes))
 
 
 def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> np.ndarray:

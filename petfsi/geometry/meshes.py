@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
+from petfsi.geometry.beams import strip_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.scene.schema import Box, Shape, Solid
@@ -35,6 +36,34 @@ FACET_TYPE = {2: "line", 3: "triangle"}
 
 
 @dataclass(frozen=True)
+class Group:
+    """Elements of one body and one kind.
+
+    Attributes
+    ----------
+    body : int
+    nodes : ndarray of int, shape (ne, n)
+        Of each element; its first dim + 1 are its corners, unless it is a patch.
+    gradients : ndarray, shape (ne, n, dim), or None
+        Of a patch, several elements with one gradient: the mean gradients of its nodes' shape functions, 1/m. Patches
+        of fewer nodes repeat one, with gradient zero.
+    volume : ndarray, shape (ne,), or None
+        Of a patch, m^3.
+    """
+
+    body: int
+    nodes: np.ndarray
+    gradients: np.ndarray | None = None
+    volume: np.ndarray | None = None
+
+    def take(self, chosen: np.ndarray) -> Group:
+        """Return some of the elements."""
+        gradients = None if self.gradients is None else self.gradients[chosen]
+        volume = None if self.volume is None else self.volume[chosen]
+        return Group(self.body, self.nodes[chosen], gradients, volume)
+
+
+@dataclass(frozen=True)
 class SimplexMesh:
     """Triangles or tetrahedra of one or more bodies, positively oriented.
 
@@ -43,13 +72,21 @@ class SimplexMesh:
     points : ndarray, shape (n, dim)
         m; each body has its own.
     cells : ndarray of int, shape (ne, dim + 1)
+        Linear simplices: what surfaces, files and pictures see.
     body : ndarray of int, shape (ne,)
         The body each cell belongs to.
+    groups : tuple of Group
+        What forces come from; without any, the cells.
     """
 
     points: np.ndarray
     cells: np.ndarray
     body: np.ndarray
+    groups: tuple[Group, ...] = ()
+
+    def elements(self, body: int) -> np.ndarray:
+        """Return the nodes of a body's elements, those of its cells where there are no groups."""
+        return next((group.nodes for group in self.groups if group.body == body), self.cells[self.body == body])
 
     @classmethod
     def union(cls, meshes: list[tuple[np.ndarray, np.ndarray]]) -> SimplexMesh:
@@ -68,7 +105,7 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
     Parameters
     ----------
     solid : Solid
-        The table; its shape is a box or a ball with cells, or a mesh file.
+        The table; its shape is a box or a ball with cells, a beam (then its strip is meshed), or a mesh file.
     dim : int
         2 for triangles, 3 for tetrahedra.
     key : str
@@ -87,6 +124,8 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
         points, cells = read_mesh(shape, dim, key, directory)
         _check(points, cells, f"{key} = {shape.mesh!r}")
         return points, cells
+    if shape.beam is not None:
+        return strip_mesh(shape.beam)
     if shape.ball is not None and shape.ball.cells is not None:
         return ball_mesh(shape.ball, dim)
     if shape.box is None or shape.box.cells is None:

@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from petfsi.errors import InputError
+from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
@@ -175,14 +176,24 @@ def _solids(scene: Scene) -> Problems:
     for name, solid in scene.solids.items():
         key = f"solids.{name}"
         yield from solid_shape(f"{key}.shape", solid.shape, scene.dim)
-        yield from length(f"{key}.initial.velocity", solid.initial.velocity, scene.dim)
-        yield from length(f"{key}.initial.displacement", solid.initial.displacement, scene.dim)
+        yield from _initial(key, solid, scene.dim)
         yield from _supports(key, solid, scene.dim)
         yield from solid_loads(key, solid, scene.dim)
-        corners = extent(solid.shape, scene.dim)
-        if scene.fluid is not None and corners is not None:
-            yield from _outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *corners)
+        beam = solid.shape.beam
+        if beam is not None:
+            yield from beam_shape(f"{key}.shape.beam", beam, scene.dim)
+        reach = corners(beam) if beam and is_sound(beam, scene.dim) else extent(solid.shape, scene.dim)
+        if scene.fluid is not None and reach is not None:
+            yield from _outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *reach)
     yield from _overlaps(scene)
+    yield from beams(scene)
+
+
+def _initial(key: str, solid: Solid, dim: int) -> Problems:
+    for name in ("velocity", "displacement"):
+        given = getattr(solid.initial, name)
+        if solid.shape.beam is None or given is None or len(given) != dim + 1:
+            yield from length(f"{key}.initial.{name}", given, dim)
 
 
 def _supports(key: str, solid: Solid, dim: int) -> Problems:
@@ -191,6 +202,8 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
         yield from place(f"{here}.where", support.where, f"{key}.shape", solid.shape, dim)
         if "z" in support.fix and dim == 2:
             yield Problem(f"{here}.fix", support.fix, "must be out of x, y, as dim = 2", ("dim",))
+        if "angle" in support.fix and solid.shape.beam is None:
+            yield Problem(f"{here}.fix", support.fix, "only a beam has an angle", (f"{key}.shape",))
         if len(set(support.fix)) < len(support.fix):
             yield Problem(f"{here}.fix", support.fix, "names an axis twice")
         for quantity in ("velocity", "displacement"):
@@ -241,8 +254,10 @@ def _probes(scene: Scene) -> Problems:
         elif probe.of not in scene.solids:
             known = ", ".join([*(["fluid"] if scene.fluid else []), *scene.solids]) or "fluid, or a solid's name"
             yield Problem(f"{key}.of", probe.of, f"must be one of {known}", (f"solids.{probe.of}",))
-        elif probe.quantity not in SOLID_QUANTITIES:
-            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}"
+        elif probe.quantity == "angle" and scene.solids[probe.of].shape.beam is None:
+            yield Problem(f"{key}.quantity", probe.quantity, "only a beam has an angle", (f"{key}.of",))
+        elif probe.quantity not in (*SOLID_QUANTITIES, "angle"):
+            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}, a beam an angle, too"
             yield Problem(f"{key}.quantity", probe.quantity, allowed, (f"{key}.of",))
 
 
@@ -251,7 +266,7 @@ def _fluid_probe(scene: Scene, key: str, probe: Probe) -> Problems:
     if fluid is None:
         yield Problem(f"{key}.of", "fluid", f"the scene has no [fluid], only {', '.join(scene.solids)}", ("fluid",))
         return
-    if probe.quantity == "displacement":
+    if probe.quantity in ("displacement", "angle"):
         yield Problem(f"{key}.quantity", probe.quantity, "a fluid has velocity, pressure and smoke", (f"{key}.of",))
     if probe.quantity == "smoke" and fluid.smoke is None:
         yield Problem(f"{key}.quantity", "smoke", "the fluid has no [fluid.smoke]", (f"{key}.of", "fluid.smoke"))

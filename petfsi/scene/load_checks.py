@@ -17,6 +17,8 @@ def place(key: str, where: str | Shape | Tagged | None, shape_key: str, shape: S
             yield Problem(f"{key}.tag", where.tag, allowed, (shape_key,))
     elif where in OPPOSITE[2] and dim == 2:
         yield Problem(key, where, NO_Z, ("dim",))
+    elif where in ("start", "end") and shape.beam is None:
+        yield Problem(key, where, "only a beam has a start and an end", (shape_key,))
 
 
 def solid_loads(key: str, solid: Solid, dim: int) -> Problems:

@@ -43,8 +43,8 @@ Vector = list[Real]
 Cells = list[Annotated[Whole, Field(ge=1)]]
 #: A number, or an expression of x, y, z, t and pi (see ``expressions.py``).
 Number = Annotated[float | str, BeforeValidator(_number_or_text)]
-Axis = Literal["x", "y", "z"]
-Place = Literal["left", "right", "bottom", "top", "back", "front", "all"]
+Component = Literal["x", "y", "z", "angle"]
+Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
 
 
 class Table(BaseModel):
@@ -102,6 +102,16 @@ class Halfspace(Table):
     normal: Vector
 
 
+class Beam(Table):
+    """A straight beam between two points (2D only), its faces half a thickness on either side."""
+
+    start: Annotated[Vector, Field(description="m")]
+    end: Annotated[Vector, Field(description="m")]
+    thickness: Annotated[Real, Field(gt=0, description="m")]
+    elements: Annotated[Whole, Field(ge=1, description="along the beam")]
+    theory: Literal["timoshenko", "euler-bernoulli"] = "timoshenko"
+
+
 class Shape(Table):
     """Exactly one of the shapes; ``mesh`` is a file that meshio reads, relative to the scene."""
 
@@ -109,6 +119,7 @@ class Shape(Table):
     ball: Ball | None = None
     cylinder: Cylinder | None = None
     halfspace: Halfspace | None = None
+    beam: Beam | None = None
     mesh: Annotated[str | None, Field(description="a file that meshio reads")] = None
     scale: Annotated[Real, Field(gt=0, description="factor on a mesh file's coordinates")] = 1.0
     translate: Annotated[Vector | None, Field(description="m, applied to a mesh file after scaling")] = None
@@ -127,7 +138,8 @@ class Shape(Table):
     @property
     def kinds(self) -> list[str]:
         """Which shapes are given; a valid shape names one."""
-        return [kind for kind in ("box", "ball", "cylinder", "halfspace", "mesh") if getattr(self, kind) is not None]
+        kinds = ("box", "ball", "cylinder", "halfspace", "beam", "mesh")
+        return [kind for kind in kinds if getattr(self, kind) is not None]
 
 
 # ---- fluid --------------------------------------------------------------------------------------------------
@@ -229,7 +241,8 @@ def _where_form(value: Any) -> str:
     return "<table>" if isinstance(value, dict | Shape) else "<name>"
 
 
-#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, a shape or a mesh file's tag.
+#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, the start or end of a beam, a shape
+#: or a mesh file's tag.
 Where = Annotated[
     Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")] | Annotated[Tagged, Tag("<tag>")],
     Discriminator(_where_form),
@@ -241,9 +254,13 @@ class Support(Table):
     """Nodes whose motion is prescribed: at rest, unless a velocity or a displacement is given."""
 
     where: Annotated[Where, Field(description=_WHERE)]
-    fix: Annotated[list[Axis], Field(min_length=1, description="axes that are held")]
-    velocity: Annotated[dict[Axis, Number], Field(description="m/s of fixed axes; may depend on x, y, z, t")] = {}
-    displacement: Annotated[dict[Axis, Number], Field(description="m of fixed axes; may depend on x, y, z, t")] = {}
+    fix: Annotated[list[Component], Field(min_length=1, description="axes that are held; of a beam its angle, too")]
+    velocity: Annotated[
+        dict[Component, Number], Field(description="m/s of fixed axes, rad/s; may depend on x, y, z, t")
+    ] = {}
+    displacement: Annotated[
+        dict[Component, Number], Field(description="m of fixed axes, rad; may depend on x, y, z, t")
+    ] = {}
 
 
 class Load(Table):
@@ -287,6 +304,10 @@ class Solid(Table):
     tangent: Annotated[
         Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
     ] = "exact"
+    elements: Annotated[Literal["linear", "quadratic"], Field(description="order of the shape functions")] = "linear"
+    volumetric: Annotated[
+        Literal["full", "reduced"], Field(description="integration of lambda's part; reduced does not lock")
+    ] = "full"
     mass: Literal["consistent", "lumped"] = "consistent"
     interior: Literal["fluid", "void"] = "fluid"
     damping: Damping = Damping()
@@ -321,7 +342,7 @@ class Probe(Table):
 
     of: Annotated[str, Field(description="a solid's name, or fluid")]
     at: Annotated[Vector, Field(description="m; in a solid, where the point is at rest")]
-    quantity: Literal["displacement", "velocity", "pressure", "smoke"]
+    quantity: Literal["displacement", "velocity", "angle", "pressure", "smoke"]
 
 
 class Output(Table):

@@ -48,7 +48,7 @@ def _shape(key: str, shape: Shape, dim: int) -> Problems:
     kinds = shape.kinds
     if len(kinds) != 1:
         found = ", ".join(kinds) or ABSENT
-        yield Problem(key, found, "must have exactly one of box, ball, cylinder, halfspace, mesh")
+        yield Problem(key, found, "must have exactly one of box, ball, cylinder, halfspace, beam, mesh")
     if shape.box is not None:
         yield from sizes(f"{key}.box", shape.box, dim)
     if shape.ball is not None:
@@ -81,6 +81,8 @@ def _cylinder(key: str, shape: Shape, dim: int) -> Problems:
 def plain_shape(key: str, shape: Shape, dim: int) -> Problems:
     """Judge a shape that is never meshed."""
     yield from _shape(key, shape, dim)
+    if shape.beam is not None:
+        yield Problem(f"{key}.beam", ABSENT, "only a solid can be a beam; give a box, ball, cylinder or halfspace here")
     for kind in ("box", "ball"):
         cells = getattr(getattr(shape, kind), "cells", None)
         if cells is not None:

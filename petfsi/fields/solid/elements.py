@@ -1,17 +1,21 @@
-"""Linear triangles and tetrahedra, total Lagrangian: from displacements to A, b and energies."""
+"""Linear and quadratic triangles and tetrahedra, total Lagrangian: from displacements to A, b and energies."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
-from numba import njit
 
-from petfsi.fields.solid.materials import Material
+from petfsi.fields.solid.kernels import kernels
+from petfsi.fields.solid.materials import Material, linear
+from petfsi.fields.solid.partition import LocalMesh
+from petfsi.fields.solid.patches import barycentric_gradients
 from petfsi.fields.solid.pattern import Pattern
+from petfsi.fields.solid.rules import Rule, linear_rule, patch_rule, quadratic_rule
+from petfsi.geometry.meshes import Group
 
-#: Elements handled at a time: their tangents stay in a core's cache.
+#: Quadrature points handled at a time: their tangents stay in a core's cache.
 CHUNK = 512
 
 
@@ -28,6 +32,8 @@ class Bodies:
     material : list of Material
     lumped : ndarray of bool
         Whether the mass matrix is diagonal.
+    reduced : ndarray of bool
+        Whether lambda's part of the energy is integrated by fewer points than mu's.
     mass_damping, stiffness_damping : ndarray
         Rayleigh's factors, 1/s and s.
     """
@@ -37,13 +43,14 @@ class Bodies:
     mu: np.ndarray
     material: list[Material]
     lumped: np.ndarray
+    reduced: np.ndarray
     mass_damping: np.ndarray
     stiffness_damping: np.ndarray
 
 
 @dataclass(frozen=True)
 class State:
-    """What a step's right-hand side is made of, at all local nodes; each of shape (n, dim).
+    """What a step's right-hand side is made of, at all local nodes; each of shape (n, width).
 
     Attributes
     ----------
@@ -60,57 +67,86 @@ class State:
     shift: np.ndarray
 
 
+class _Batch:
+    """A group of elements, ready for the kernels; ``parts`` cuts it into slices that fit a core's cache."""
+
+    def __init__(self, points: np.ndarray, group: Group, bodies: Bodies):
+        dim = points.shape[1]
+        self.body = group.body
+        self.cells = np.ascontiguousarray(group.nodes, dtype=np.int32)
+        n = self.cells.shape[1]
+        self.rule = rule = _rule(group, dim, bool(bodies.reduced[group.body]))
+        if group.gradients is None or group.volume is None:
+            self.basis = barycentric_gradients(points, self.cells)
+            edges = points[self.cells[:, 1 : dim + 1]] - points[self.cells[:, :1]]
+            self.volume = np.linalg.det(edges) / (2.0 if dim == 2 else 6.0)
+        else:
+            self.basis, self.volume = group.gradients, group.volume
+        self.weights = self.volume[:, None] * rule.weights
+        self.loops = kernels(dim, n, len(rule.weights) == 1)
+        self.is_patch = not rule.mass.any()
+        density = bodies.density[group.body]
+        self.mass = density * (np.diag(rule.lumped) if bodies.lumped[group.body] else rule.mass)
+        self.lumped = density * rule.lumped
+        self.chunk = max(CHUNK // len(rule.weights), 1)
+        self.lame = np.tile(bodies.lame[group.body] * rule.lame, self.chunk)
+        self.mu = np.tile(bodies.mu[group.body] * rule.mu, self.chunk)
+        self.material = bodies.material[group.body]
+
+    def parts(self) -> Iterator[slice]:
+        for begin in range(0, len(self.cells), self.chunk):
+            yield slice(begin, min(begin + self.chunk, len(self.cells)))
+
+    def gradients(self, field: np.ndarray, part: slice) -> np.ndarray:
+        """Return the gradient of a field of all local nodes at every point, shape (count * Q, dim, dim)."""
+        count, dim = part.stop - part.start, self.basis.shape[2]
+        H = np.empty((count * len(self.rule.weights), dim, dim))
+        self.loops.gradient(self.cells[part], self.basis[part], self.rule.table, field, H)
+        return H
+
+    def respond(self, d: np.ndarray, part: slice, tangent: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return energy density, stress and tangent at every point."""
+        H = self.gradients(d, part)
+        return self.material(H, self.lame[: len(H)], self.mu[: len(H)], tangent)
+
+    def mass_product(self, volume: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
+        """Return u . M v over elements of the given volumes."""
+        return 0.0 if self.is_patch else float(self.loops.kinetic(self.cells, volume, self.mass, u, v))
+
+
+def _rule(group: Group, dim: int, reduced: bool) -> Rule:
+    n = group.nodes.shape[1]
+    if group.gradients is not None:
+        return patch_rule(n)
+    return linear_rule(dim, reduced) if n == dim + 1 else quadratic_rule(dim, reduced)
+
+
 class Elements:
-    """Constant-strain elements of any number of bodies.
+    """Elements of any number of bodies.
 
-    With N_a the shape functions, g_a = grad N_a and F = I + sum_a d_a g_a^T, constant in an element of volume V,
+    With N_a the shape functions, g_a = grad N_a and F = I + sum_a d_a g_a^T at quadrature points of weight w,
 
-        K_a[i] = V P[i,J] g_a[J],    K'_ab[i,k] = V g_a[J] C[i,J,k,L] g_b[L],
-        M_ab = density V (1 + delta_ab) / ((dim + 1)(dim + 2))   or, lumped,   density V delta_ab / (dim + 1).
+        K_a[i] = sum w P[i,J] g_a[J],    K'_ab[i,k] = sum w g_a[J] C[i,J,k,L] g_b[L],    M_ab = int density N_a N_b
+
+    or, lumped, M's diagonal scaled to its total. P and C are symmetric in what they say of pairs, and so is K', to
+    the last bit.
 
     Parameters
     ----------
-    points : ndarray, shape (n, dim)
-        Reference positions, m.
-    cells : ndarray of int32, shape (ne, dim + 1)
-        Sorted by body.
-    body : ndarray of int32, shape (ne,)
+    mesh : LocalMesh
     bodies : Bodies
+
+    Attributes
+    ----------
+    constant : bool
+        Whether K' is the same at every displacement.
     """
 
-    def __init__(self, points: np.ndarray, cells: np.ndarray, body: np.ndarray, bodies: Bodies):
-        self.dim = points.shape[1]
-        self.cells = cells
-        self.body = body
+    def __init__(self, mesh: LocalMesh, bodies: Bodies):
+        self.dim = mesh.points.shape[1]
         self.bodies = bodies
-        edges = points[cells[:, 1:]] - points[cells[:, :1]]
-        self.volume = np.linalg.det(edges) / (2.0 if self.dim == 2 else 6.0)
-        rest = np.linalg.inv(edges).transpose(0, 2, 1)
-        self.gradients = np.concatenate((-rest.sum(axis=1, keepdims=True), rest), axis=1)
-        corners = self.dim + 1
-        off = np.where(bodies.lumped, 0.0, 1 / (corners * (corners + 1)))
-        # per body: factors of density * V on and off the diagonal of an element's mass matrix
-        self.mass_factors = np.column_stack((1 / corners - off * self.dim, off))
-        self._kernels = _KERNELS[self.dim]
-
-    def chunks(self) -> list[tuple[int, int, int]]:
-        """Return (begin, end, body) of runs of at most ``CHUNK`` elements of one body."""
-        ends = np.searchsorted(self.body, np.arange(len(self.bodies.density) + 1))
-        return [
-            (k, min(k + CHUNK, int(end)), b)
-            for b, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True))
-            for k in range(int(begin), int(end), CHUNK)
-        ]
-
-    def displacement_gradients(self, d: np.ndarray, begin: int = 0, end: int | None = None) -> np.ndarray:
-        """Return H = dd/dX of elements ``begin`` to ``end``, shape (count, dim, dim); ``d`` holds all local nodes."""
-        return self._kernels.gradient(self.cells[begin:end], self.gradients[begin:end], d)
-
-    def respond(self, d: np.ndarray, begin: int, end: int, body: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return energy density, stress and tangent of elements of one body."""
-        H = self.displacement_gradients(d, begin, end)
-        lame, mu = np.full(len(H), self.bodies.lame[body]), np.full(len(H), self.bodies.mu[body])
-        return self.bodies.material[body](H, lame, mu)
+        self.batches = [_Batch(mesh.points, group, bodies) for group in mesh.groups]
+        self.constant = all(material is linear for material in bodies.material)
 
     def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
         """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective.
@@ -130,24 +166,81 @@ class Elements:
         """
         values[:] = 0.0
         b[:] = 0.0
-        A_M, A_K = a + self.bodies.mass_damping, k + self.bodies.stiffness_damping
-        for begin, end, body in self.chunks():
-            _, P, C = self.respond(at.displacement, begin, end, body)
-            part = slice(begin, end)
-            self._kernels.scatter(
-                self.cells[part], self.gradients[part], self.volume[part], P, C,
-                at.inertia, at.shift, self.bodies.density[body] * self.mass_factors[body], A_M[body], A_K[body],
-                pattern.node_ptr, pattern.slots[part], values, b,
-            )  # fmt: skip
+        shifted = bool(at.shift.any())
+        for batch, slots in zip(self.batches, pattern.slots, strict=True):
+            A_M = a + self.bodies.mass_damping[batch.body]
+            A_K = k + self.bodies.stiffness_damping[batch.body]
+            for part in batch.parts():
+                C = self._add_forces(batch, part, at, shifted, True, b)
+                batch.loops.tangent(
+                    batch.cells[part], batch.basis[part], batch.rule.table, batch.weights[part], C,
+                    batch.volume[part], batch.mass, A_M, A_K, pattern.node_ptr, slots[part], values,
+                )  # fmt: skip
+
+    def forces(self, at: State, b: np.ndarray) -> None:
+        """Fill b with  M V - K'(d) s - K(d). Not collective.
+
+        Parameters
+        ----------
+        at : State
+            Without a shift no tangent is computed.
+        b : ndarray, shape (n_owned, dim)
+            Overwritten.
+        """
+        b[:] = 0.0
+        shifted = bool(at.shift.any())
+        for batch in self.batches:
+            for part in batch.parts():
+                self._add_forces(batch, part, at, shifted, shifted, b)
+
+    def _add_forces(
+        self, batch: _Batch, part: slice, at: State, shifted: bool, tangent: bool, b: np.ndarray
+    ) -> np.ndarray:
+        cells, loops = batch.cells[part], batch.loops
+        _, P, C = batch.respond(at.displacement, part, tangent)
+        if shifted:
+            loops.contract(C, batch.gradients(at.shift, part), P)
+        loops.forces(
+            cells, batch.basis[part], batch.rule.table, batch.weights[part], P,
+            batch.volume[part], batch.mass, at.inertia, b,
+        )  # fmt: skip
+        return C
+
+    # ---- masses -----------------------------------------------------------------------------------------------
+
+    def lumped_mass(self, n: int) -> np.ndarray:
+        """Return a positive diagonal mass of the first ``n`` nodes, shape (n, dim), kg."""
+        return np.repeat(self._scattered([batch.lumped for batch in self.batches], n)[:, None], self.dim, axis=1)
+
+    def uniform_load(self, n: int) -> np.ndarray:
+        """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, dim), kg."""
+        weight = self._scattered([batch.mass.sum(axis=1) for batch in self.batches], n)
+        return np.eye(self.dim)[:, None, :] * weight[None, :, None]
+
+    def _scattered(self, tables: list[np.ndarray], n: int) -> np.ndarray:
+        total = np.zeros(n)
+        for batch, table in zip(self.batches, tables, strict=True):
+            share = np.outer(batch.volume, table).ravel()
+            total += np.bincount(batch.cells.ravel(), weights=share, minlength=n)[:n]
+        return total
+
+    # ---- energies ---------------------------------------------------------------------------------------------
+
+    def _counted(self, counted: np.ndarray) -> list[tuple[_Batch, np.ndarray]]:
+        """Return each batch with the volumes of its elements, zero where they are not counted."""
+        ends = np.cumsum([len(batch.cells) for batch in self.batches])
+        each = np.split(counted, ends[:-1])
+        return [(b, np.where(chosen, b.volume, 0.0)) for b, chosen in zip(self.batches, each, strict=True)]
 
     def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
         """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
         kinetic = elastic = 0.0
-        for begin, end, body in self.chunks():
-            V = np.where(counted[begin:end], self.volume[begin:end], 0.0)
-            elastic += float(V @ self.respond(d, begin, end, body)[0])
-            mass = self.bodies.density[body] * self.mass_factors[body]
-            kinetic += 0.5 * self._kernels.mass_product(self.cells[begin:end], V, mass, u, u)
+        for batch, volume in self._counted(counted):
+            for part in batch.parts():
+                W = batch.respond(d, part, tangent=False)[0].reshape(-1, len(batch.rule.weights))
+                chosen = volume[part] > 0
+                elastic += float(volume[part][chosen] @ (W[chosen] @ batch.rule.weights))
+            kinetic += 0.5 * batch.mass_product(volume, u, u)
         return kinetic, elastic
 
     def powers(
@@ -167,119 +260,30 @@ class Elements:
             1/s, s.
         w, g : ndarray, shape (n, dim)
             The solution, and any other velocity, m/s.
-        counted : ndarray of bool, shape (ne,)
+        counted : ndarray of bool, shape (n_elements,)
+            Group after group.
         """
         damping = power = 0.0
-        for begin, end, body in self.chunks():
-            part = slice(begin, end)
-            _, P, C = self.respond(at.displacement, begin, end, body)
-            lost, done = self._kernels.powers(
-                self.cells[part], self.gradients[part], np.where(counted[part], self.volume[part], 0.0), P, C,
-                at.inertia, at.shift, w, g, self.bodies.density[body] * self.mass_factors[body], (a, k),
-                (self.bodies.mass_damping[body], self.bodies.stiffness_damping[body]),
-            )  # fmt: skip
-            damping, power = damping + lost, power + done
+        for batch, volume in self._counted(counted):
+            a0, a1 = self.bodies.mass_damping[batch.body], self.bodies.stiffness_damping[batch.body]
+            damping += a0 * batch.mass_product(volume, w, w)
+            power += batch.mass_product(volume, g, (a + a0) * w - at.inertia)
+            for part in batch.parts():
+                _, P, C = batch.respond(at.displacement, part)
+                weights = np.outer(volume[part], batch.rule.weights).ravel()
+                rate, slope = batch.gradients(w, part), batch.gradients(g, part)
+                stress = np.zeros_like(P)
+                batch.loops.contract(C, rate, stress)
+                damping += a1 * float(weights @ (stress * rate).sum(axis=(1, 2)))
+                batch.loops.contract(C, batch.gradients(at.shift, part), P)
+                power += float(weights @ ((P + (k + a1) * stress) * slope).sum(axis=(1, 2)))
         return damping, power
 
-    def uniform_load(self, n: int) -> np.ndarray:
-        """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, dim), kg."""
-        share = np.repeat(self.bodies.density[self.body] * self.volume / (self.dim + 1), self.dim + 1)
-        mass = np.bincount(self.cells.ravel(), weights=share, minlength=n)[:n]
-        return np.eye(self.dim)[:, None, :] * mass[:, None]
-
-
-def _compile(dim: int) -> SimpleNamespace:
-    # dim as a constant of the closure lets the compiler unroll the loops over axes and corners
-
-    @njit(cache=True)
-    def gradient(cells, gradients, d):
-        H = np.empty((cells.shape[0], dim, dim))
-        for e in range(cells.shape[0]):
-            for i in range(dim):
-                for J in range(dim):
-                    H[e, i, J] = 0.0
-                    for a in range(dim + 1):
-                        H[e, i, J] += d[cells[e, a], i] * gradients[e, a, J]
-        return H
-
-    @njit(cache=True)
-    def scatter(cells, gradients, volume, P, C, inertia, shift, mass, A_M, A_K, node_ptr, slots, values, b):
-        Cg = np.empty((dim, dim, dim))
-        for e in range(cells.shape[0]):
-            V = volume[e]
-            for q in range(dim + 1):
-                column = cells[e, q]
-                for i in range(dim):
-                    for J in range(dim):
-                        for k in range(dim):
-                            s = 0.0
-                            for L in range(dim):
-                                s += C[e, i, J, k, L] * gradients[e, q, L]
-                            Cg[i, J, k] = V * s
-                for a in range(dim + 1):
-                    row = cells[e, a]
-                    slot = slots[e, a, q]
-                    if slot < 0:
-                        continue
-                    begin = node_ptr[row]
-                    width = dim * (node_ptr[row + 1] - begin)
-                    start = dim * (dim * begin + slot - begin)
-                    m = V * (mass[0] if a == q else mass[1])
-                    for i in range(dim):
-                        for k in range(dim):
-                            stiffness = 0.0
-                            for J in range(dim):
-                                stiffness += gradients[e, a, J] * Cg[i, J, k]
-                            entry = A_K * stiffness
-                            load = -stiffness * shift[column, k]
-                            if i == k:
-                                entry += A_M * m
-                                load += m * inertia[column, k]
-                            values[start + i * width + k] += entry
-                            b[row, i] += load
-                        if a == q:
-                            for J in range(dim):
-                                b[row, i] -= V * P[e, i, J] * gradients[e, a, J]
-
-    @njit(cache=True)
-    def mass_product(cells, volume, mass, u, v):
-        total = 0.0
-        for e in range(cells.shape[0]):
-            for i in range(dim):
-                same = sum_u = sum_v = 0.0
-                for a in range(dim + 1):
-                    same += u[cells[e, a], i] * v[cells[e, a], i]
-                    sum_u += u[cells[e, a], i]
-                    sum_v += v[cells[e, a], i]
-                total += volume[e] * ((mass[0] - mass[1]) * same + mass[1] * sum_u * sum_v)
-        return total
-
-    @njit(cache=True)
-    def powers(cells, gradients, volume, P, C, inertia, shift, w, g, mass, factors, damping):
-        (a, k), (a0, a1) = factors, damping
-        lost = a0 * mass_product(cells, volume, mass, w, w)
-        done = (a + a0) * mass_product(cells, volume, mass, g, w) - mass_product(cells, volume, mass, g, inertia)
-        slope_w, slope_s, slope_g = np.empty((dim, dim)), np.empty((dim, dim)), np.empty((dim, dim))
-        for e in range(cells.shape[0]):
-            for i in range(dim):
-                for J in range(dim):
-                    slope_w[i, J] = slope_s[i, J] = slope_g[i, J] = 0.0
-                    for q in range(dim + 1):
-                        slope_w[i, J] += w[cells[e, q], i] * gradients[e, q, J]
-                        slope_s[i, J] += shift[cells[e, q], i] * gradients[e, q, J]
-                        slope_g[i, J] += g[cells[e, q], i] * gradients[e, q, J]
-            for i in range(dim):
-                for J in range(dim):
-                    rate = moved = 0.0
-                    for m in range(dim):
-                        for L in range(dim):
-                            rate += C[e, i, J, m, L] * slope_w[m, L]
-                            moved += C[e, i, J, m, L] * slope_s[m, L]
-                    lost += volume[e] * a1 * rate * slope_w[i, J]
-                    done += volume[e] * (P[e, i, J] + moved + (k + a1) * rate) * slope_g[i, J]
-        return lost, done
-
-    return SimpleNamespace(gradient=gradient, scatter=scatter, mass_product=mass_product, powers=powers)
-
-
-_KERNELS = {2: _compile(2), 3: _compile(3)}
+    def smallest_ratio(self, d: np.ndarray) -> float:
+        """Return the smallest det F of this rank's quadrature points."""
+        least = np.inf
+        for batch in self.batches:
+            for part in batch.parts():
+                F = np.eye(self.dim) + batch.gradients(d, part)
+                least = min(least, float(np.linalg.det(F).min()))
+        return least

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.geometry.meshes import SimplexMesh
+from petfsi.geometry.meshes import Group, SimplexMesh
 from petfsi.petsc import IntType, Layout
 
 
@@ -82,8 +82,12 @@ class LocalMesh:
     body : ndarray of int32, shape (ne,)
     cell_ids : ndarray of int, shape (ne,)
         Number of each cell in the whole mesh.
-    counted : ndarray of bool, shape (ne,)
+    counted_cells : ndarray of bool, shape (ne,)
         Each cell of the whole mesh is counted on exactly one rank.
+    groups : tuple of Group
+        Elements, in local node numbers; none where the cells are the elements.
+    counted : ndarray of bool, shape (n_elements,)
+        Each element of the whole mesh, group after group, is counted on exactly one rank.
     number : ndarray of IntType, shape (n_nodes,)
         Global node number: rank after rank, on each in the order of the whole mesh.
     natural : ndarray of int, shape (n_nodes,)
@@ -96,10 +100,21 @@ class LocalMesh:
     cells: np.ndarray
     body: np.ndarray
     cell_ids: np.ndarray
+    counted_cells: np.ndarray
+    groups: tuple[Group, ...]
     counted: np.ndarray
     number: np.ndarray
     natural: np.ndarray
     nodes: Layout
+
+    def elements(self, body: int) -> np.ndarray:
+        """Return the nodes of a body's elements, those of its cells where there are no groups."""
+        return next((group.nodes for group in self.groups if group.body == body), self.cells[self.body == body])
+
+    @property
+    def connectivity(self) -> list[np.ndarray]:
+        """The nodes of the elements of each group, or of the cells."""
+        return [group.nodes for group in self.groups] or [self.cells]
 
     @property
     def n_owned(self) -> int:
@@ -116,7 +131,10 @@ def distribute(comm: MPI.Comm, mesh: SimplexMesh) -> tuple[LocalMesh, np.ndarray
     owned = np.flatnonzero(owner == comm.rank)
     cell_ids = np.flatnonzero(np.any(owner[mesh.cells] == comm.rank, axis=1))
     cells = mesh.cells[cell_ids]
-    ghosts = np.unique(cells[owner[cells] != comm.rank])
+    groups = [group.take(np.any(owner[group.nodes] == comm.rank, axis=1)) for group in mesh.groups]
+    elements = [group.nodes for group in groups] or [cells]
+    around = np.unique(np.concatenate([nodes.ravel() for nodes in [cells, *elements]]))
+    ghosts = around[owner[around] != comm.rank]
     natural = np.concatenate((owned, ghosts[np.argsort(number[ghosts])]))
     local = np.full(len(order), -1, dtype=np.int32)
     local[natural] = np.arange(len(natural), dtype=np.int32)
@@ -125,7 +143,9 @@ def distribute(comm: MPI.Comm, mesh: SimplexMesh) -> tuple[LocalMesh, np.ndarray
         cells=np.ascontiguousarray(local[cells]),
         body=mesh.body[cell_ids].astype(np.int32),
         cell_ids=cell_ids,
-        counted=owner[cells[:, 0]] == comm.rank,
+        counted_cells=owner[cells[:, 0]] == comm.rank,
+        groups=tuple(replace(group, nodes=np.ascontiguousarray(local[group.nodes])) for group in groups),
+        counted=owner[np.concatenate([nodes[:, 0] for nodes in elements])] == comm.rank,
         number=number[natural],
         natural=natural,
         nodes=Layout.of(comm, len(owned)),

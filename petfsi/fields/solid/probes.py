@@ -9,6 +9,8 @@ from mpi4py import MPI
 
 from petfsi.errors import InputError
 from petfsi.fields.solid.partition import LocalMesh
+from petfsi.fields.solid.patches import barycentric_gradients
+from petfsi.fields.solid.rules import shape_functions
 
 #: Barycentric coordinates down to this count as inside.
 SLACK = -1e-9
@@ -30,17 +32,15 @@ class Place:
         return result
 
 
-def locate(comm: MPI.Comm, mesh: LocalMesh, gradients: np.ndarray, body: int, at: np.ndarray, key: str) -> Place:
+def locate(comm: MPI.Comm, mesh: LocalMesh, body: int, at: np.ndarray, key: str) -> Place:
     """Return the place of a reference position in a body. Collective.
 
-    It lies in the first cell that contains it, else at the nearest node.
+    It lies in the first element that contains it, where its shape functions are the weights, else at the nearest node.
 
     Parameters
     ----------
     comm : MPI.Comm
     mesh : LocalMesh
-    gradients : ndarray, shape (ne, dim + 1, dim)
-        Of the shape functions of this rank's cells.
     body : int
     at : ndarray, shape (dim,)
     key : str
@@ -51,18 +51,21 @@ def locate(comm: MPI.Comm, mesh: LocalMesh, gradients: np.ndarray, body: int, at
     InputError
         If it is farther from the nearest node than that node's longest edge.
     """
-    cells = np.flatnonzero(mesh.body == body)
-    corners = mesh.points[mesh.cells[cells]]
+    dim = mesh.points.shape[1]
+    elements = mesh.elements(body)
+    corners = mesh.points[elements[:, : dim + 1]]
     slack = 1e-6 * np.ptp(corners, axis=1).max(axis=1, keepdims=True)
     near = np.all((corners.min(axis=1) - slack <= at) & (at <= corners.max(axis=1) + slack), axis=1)
-    cells, corners = cells[near], corners[near]
-    offset = np.einsum("eaj,ej->ea", gradients[cells], at - corners.mean(axis=1))
-    weights = 1 / corners.shape[1] + offset
-    hits = np.flatnonzero(weights.min(axis=1, initial=np.inf) >= SLACK)
+    nodes, corners = elements[near], corners[near]
+    offset = np.einsum("eaj,ej->ea", barycentric_gradients(mesh.points, nodes), at - corners.mean(axis=1))
+    barycentric = 1 / (dim + 1) + offset
+    hits = np.flatnonzero(barycentric.min(axis=1, initial=np.inf) >= SLACK)
     found = None
     if len(hits):
-        first = hits[0]
-        found = (mesh.cell_ids[cells[first]], mesh.number[mesh.cells[cells[first]]], weights[first])
+        # on a face between elements every rank must choose the same one: the first by its nodes in the whole mesh
+        chosen = min(hits, key=lambda hit: mesh.natural[nodes[hit]].tolist())
+        weights = shape_functions(barycentric[chosen], nodes.shape[1])
+        found = (mesh.natural[nodes[chosen]].tolist(), mesh.number[nodes[chosen]], weights)
     answers = [answer for answer in comm.allgather(found) if answer is not None]
     if answers:
         _, nodes, weight = min(answers, key=lambda answer: answer[0])

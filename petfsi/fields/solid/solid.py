@@ -15,10 +15,12 @@ from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.loads import Body, Loads
 from petfsi.fields.solid.materials import MATERIALS, Material, lame_parameters, projected
 from petfsi.fields.solid.partition import slab
+from petfsi.fields.solid.patches import grid_patches, grouped_mesh, grown_patches
 from petfsi.fields.solid.probes import Place, locate
 from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.meshes import SimplexMesh
-from petfsi.geometry.surfaces import Surface, boundary_facets, shells
+from petfsi.geometry.quadratic import with_middles
+from petfsi.geometry.surfaces import Surface, boundary_facets, shells, signed_volumes
 from petfsi.petsc import IntType
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene, Solid
@@ -43,7 +45,7 @@ class SimplexSolid(NodalSolid):
         self._places: dict[tuple[str, tuple[float, ...]], Place] = {}
 
     def _make_elements(self, solids: Mapping[str, Solid]) -> Elements:
-        return Elements(self._mesh.points, self._mesh.cells, self._mesh.body, _bodies(solids))
+        return Elements(self._mesh, _bodies(solids))
 
     def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Loads | None:
         if not any(solid.loads or solid.body_force for solid in solids.values()):
@@ -51,13 +53,12 @@ class SimplexSolid(NodalSolid):
         bodies, places = {}, {}
         for index, (name, solid) in enumerate(solids.items()):
             nodes = np.flatnonzero(self._node_body == index)
-            elements = np.searchsorted(nodes, mesh.cells[mesh.body == index])
-            local = self._mesh.cells[self._mesh.body == index]
-            bodies[name] = Body(nodes, mesh.points[nodes], elements, local, self._tags[name])
+            elements = np.searchsorted(nodes, mesh.elements(index))
+            bodies[name] = Body(nodes, mesh.points[nodes], elements, self._mesh.elements(index), self._tags[name])
             for n, load in enumerate(solid.loads):
                 if load.at is not None:
                     at, key = np.array(load.at), f"solids.{name}.loads.{n}: the force"
-                    places[name, n] = locate(self.comm, self._mesh, self._elements.gradients, index, at, key)
+                    places[name, n] = locate(self.comm, self._mesh, index, at, key)
         return Loads(self.comm, solids, bodies, self._mesh, self._pattern, places)
 
     def _make_surface(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Surface:
@@ -138,22 +139,18 @@ class SimplexSolid(NodalSolid):
 
     # ---- what others read -------------------------------------------------------------------------------------
 
-    def _volume_ratios(self) -> np.ndarray:
-        """Return det F of this rank's elements. Collective."""
-        H = self._elements.displacement_gradients(self._with_shared(self.displacement))
-        return np.linalg.det(np.eye(self.dim) + H)
-
     def quality(self) -> float:
-        """Return the smallest det F: 1 at rest, 0 or less where an element is inverted. Collective."""
-        J = self._volume_ratios()
-        return self.comm.allreduce(float(J.min(initial=np.inf)), MPI.MIN)
+        """Return the smallest det F where stress is taken: 1 at rest, 0 or less if inverted. Collective."""
+        least = self._elements.smallest_ratio(self._with_shared(self.displacement))
+        return self.comm.allreduce(least, MPI.MIN)
 
     def volumes(self) -> dict[str, float]:
-        """Return the present volume of each body, m^3 (m^2 in 2D). Collective."""
-        J = self._volume_ratios()
-        own = np.where(self._mesh.counted, J * self._elements.volume, 0.0)
+        """Return the volume that each body's surface encloses, m^3 (m^2 in 2D). Collective."""
+        mesh = self._mesh
+        present = signed_volumes(mesh.points + self._with_shared(self.displacement), mesh.cells)
+        own = np.where(mesh.counted_cells, present, 0.0)
         total = np.empty(len(self.names))
-        self.comm.Allreduce(np.bincount(self._mesh.body, weights=own, minlength=len(self.names)), total)
+        self.comm.Allreduce(np.bincount(mesh.body, weights=own, minlength=len(self.names)), total)
         return dict(zip(self.names, total.tolist(), strict=True))
 
     def probe(self, body: str, at: tuple[float, ...] | list[float], quantity: str) -> np.ndarray:
@@ -167,9 +164,7 @@ class SimplexSolid(NodalSolid):
         key = body, tuple(at)
         if key not in self._places:
             index, x = self.names.index(body), np.asarray(at, dtype=float)
-            self._places[key] = locate(
-                self.comm, self._mesh, self._elements.gradients, index, x, f"a probe of solids.{body}"
-            )
+            self._places[key] = locate(self.comm, self._mesh, index, x, f"a probe of solids.{body}")
         return self._places[key].value(self.comm, self._mesh, getattr(self, quantity))
 
     def output(self) -> dict[str, Slab]:
@@ -183,7 +178,16 @@ def _powers(dim: int, degree: int) -> list[tuple[int, ...]]:
 
 
 def _union(scene: Scene) -> SimplexMesh:
-    return SimplexMesh.union(list(build_bodies(scene).values()))
+    """Return the mesh of all bodies, quadratic ones with the middles of their edges, reduced linear ones in patches."""
+    bodies = []
+    for (points, cells), solid in zip(build_bodies(scene).values(), scene.solids.values(), strict=True):
+        patch = None
+        if solid.elements == "quadratic":
+            points, cells = with_middles(points, cells)
+        elif solid.volumetric == "reduced":
+            patch = (grid_patches if solid.shape.box is not None else grown_patches)(cells, scene.dim)
+        bodies.append((points, cells, patch))
+    return grouped_mesh(bodies)
 
 
 def _bodies(solids: Mapping[str, Solid]) -> Bodies:
@@ -194,6 +198,7 @@ def _bodies(solids: Mapping[str, Solid]) -> Bodies:
         mu=lame[:, 1],
         material=[_material(solid) for solid in solids.values()],
         lumped=np.array([solid.mass == "lumped" for solid in solids.values()]),
+        reduced=np.array([solid.volumetric == "reduced" for solid in solids.values()]),
         mass_damping=np.array([solid.damping.mass for solid in solids.values()]),
         stiffness_damping=np.array([solid.damping.stiffness for solid in solids.values()]),
     )

@@ -82,13 +82,15 @@ def _compile(dim):
                     P[e, i, j] = p
             if not tangent:
                 continue
-            crossed = mu[e] - lame[e] * log_J
+            plain, crossed, volumetric = mu[e], mu[e] - lame[e] * log_J, lame[e]
             for i in range(dim):
                 for j in range(dim):
+                    own = volumetric * G[i, j]
                     for k in range(dim):
+                        other = crossed * G[k, j]
                         for L in range(dim):
-                            C[e, i, j, k, L] = crossed * G[i, L] * G[k, j] + lame[e] * G[i, j] * G[k, L]
-                    C[e, i, j, i, j] += mu[e]
+                            C[e, i, j, k, L] = other * G[i, L] + own * G[k, L]
+                    C[e, i, j, i, j] += plain
         return W, P, C
 
     return kernel
