@@ -245,7 +245,8 @@ def _where_form(value: Any) -> str:
     return "<table>" if isinstance(value, dict | Shape) else "<name>"
 
 
-#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, a shape or a mesh file's tag.
+#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, the start or end of a beam, a shape
+#: or a mesh file's tag.
 Where = Annotated[
     Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")] | Annotated[Tagged, Tag("<tag>")],
     Discriminator(_where_form),
