@@ -113,7 +113,7 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
         unknowns += n
         rows.append(("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, scene.fluid.cells))}"))
     if nodes:
-        n = scene.dim * sum(nodes.values())
+        n = sum(count * (scene.dim if scene.solids[name].shape.beam is None else 3) for name, count in nodes.items())
         unknowns += n
         bodies = "; ".join(f"{name} {nodes[name]:,} nodes, {cells[name]:,} cells" for name in nodes)
         rows.append(("solid", f"{n:,} unknowns ({bodies})"))
@@ -153,6 +153,7 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     if len(boxes) == len(scene.solids) and not scene.obstacles:
         nodes = {name: math.prod(n + 1 for n in box) for name, box in boxes.items()}
         return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
+    from petfsi.geometry.beams import axis_mesh
     from petfsi.geometry.bodies import build_bodies
     from petfsi.geometry.meshes import read_surface
     from petfsi.geometry.obstacles import obstacle_surfaces
@@ -172,6 +173,8 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
             errors += [line for line in str(error).splitlines() if line not in errors]
     if errors:
         raise InputError("\n".join(errors))
+    beams = {name: solid.shape.beam for name, solid in scene.solids.items() if solid.shape.beam is not None}
+    meshes |= {name: axis_mesh(beam) for name, beam in beams.items()}
     return {n: len(points) for n, (points, _) in meshes.items()}, {n: len(cells) for n, (_, cells) in meshes.items()}
 
 

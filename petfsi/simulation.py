@@ -205,7 +205,8 @@ class Simulation:
 
     def _check_speed(self, solid: SolidField, velocity: np.ndarray, dt: float) -> None:
         """Raise if a node would cross the whole scene in one step: the state has blown up."""
-        fastest = self.comm.allreduce(float(np.abs(velocity).max(initial=0.0)), MPI.MAX)
+        along = velocity.reshape(-1, solid.width)[:, : self.scene.dim]  # a beam's rotations are no way to go
+        fastest = self.comm.allreduce(float(np.abs(along).max(initial=0.0)), MPI.MAX)
         extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
         if self.stable.limited:
             self.stable.moved(fastest * dt)
@@ -234,7 +235,7 @@ class Simulation:
     def _probe_values(self, measure: Callable) -> Iterator[tuple[str, float]]:
         for name, spec in self.scene.probes.items():
             value = measure(spec.of, spec.at, spec.quantity)
-            if spec.quantity in ("pressure", "smoke"):
+            if spec.quantity in ("pressure", "smoke", "angle"):
                 yield name, float(np.ravel(value)[0])
             else:
                 yield from ((f"{name}.{axis}", float(v)) for axis, v in zip("xyz", value, strict=False))

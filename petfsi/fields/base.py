@@ -68,11 +68,14 @@ class Work:
         Taken by damping.
     boundary : float
         Done, and brought along, by all that lies beyond: supports, inflows, open sides.
+    loads : float
+        Done by body forces and loads.
     """
 
     gravity: float = 0.0
     damping: float = 0.0
     boundary: float = 0.0
+    loads: float = 0.0
 
 
 #: Reads the piece ``[start, start + count)`` of the stored array of that name: ``read(name, start, count)``.
@@ -226,6 +229,8 @@ class SolidField(Field):
 
     Attributes
     ----------
+    width : int
+        Unknowns a node; the first ones are velocities along the axes.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
@@ -238,6 +243,7 @@ class SolidField(Field):
         Whether its tangent never changes, and neither does the stable step.
     """
 
+    width: int
     extent: float
     moved: np.ndarray
     finest: float
@@ -261,7 +267,7 @@ class SolidField(Field):
 
     @abstractmethod
     def surface(self) -> Surface:
-        """Return the wet surface, the same on every rank."""
+        """Return the wet surface, the same on every rank; another object where its maps have changed. Collective."""
 
     @abstractmethod
     def surface_positions(self) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Protocol
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
@@ -13,54 +13,19 @@ from petsc4py import PETSc
 
 from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.lumped import LumpedEquation
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.meshes import SimplexMesh
+from petfsi.geometry.places import Tags, read_tags
 from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, relinearised, stable_step
 from petfsi.petsc import Layout, new_block, set_csr
+from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene, Solid
-
-
-class ElementLibrary(Protocol):
-    """What a solid's elements offer; arrays are over all local nodes, shape (n, width), but for ``b`` (owned ones)."""
-
-    @property
-    def constant(self) -> bool:
-        """Whether K' never changes."""
-        ...
-
-    def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
-        """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective."""
-        ...
-
-    def forces(self, at: State, b: np.ndarray) -> None:
-        """Fill b alone, without a matrix. Not collective."""
-        ...
-
-    def lumped_mass(self, n: int) -> np.ndarray:
-        """Return the diagonal of the lumped mass at the first ``n`` nodes, shape (n, width), kg."""
-        ...
-
-    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
-        """Return no less than the largest eigenvalue of M^-1 K'(d), M diagonal, of these elements, 1/s^2."""
-        ...
-
-    def uniform_load(self, n: int) -> np.ndarray:
-        """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, width), kg."""
-        ...
-
-    def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
-        """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
-        ...
-
-    def powers(
-        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
-    ) -> tuple[float, float]:
-        """Return what damping takes and what g does against the step's forces, W. Not collective."""
-        ...
+from petfsi.scene.stepping import Stepping
 
 
 class NodalSolid(SolidField):
@@ -116,21 +81,27 @@ class NodalSolid(SolidField):
         self.reference = self._mesh.points[:n_owned]
         self.layout = Layout.of(comm, self.width * n_owned)
         self._elements = self._make_elements(solids)
-        self.is_linear = self._elements.constant
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
         self._uniform = self._elements.uniform_load(n_owned)
         self._reference_mass = comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points)
 
-        self._supports = Supports(solids, mesh.points, self._node_body, self._number, components)
-        self._set_exchange(mesh)
+        self._tags = on_root(comm, lambda: _tags(scene, solids))
+        self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
         self._damping = np.array([[solid.damping.mass, solid.damping.stiffness] for solid in solids.values()])
         self._lumped = self._lump() if self.explicit else None
         self._set_pattern()
-        self._set_motion(mesh, solids)
+        self._loads = self._make_loads(mesh, solids)
+        self.is_linear = self._elements.constant and not (self._loads is not None and self._loads.follow)
+        self._set_exchange(mesh)
+        self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
 
     @abstractmethod
     def _make_elements(self, solids: Mapping[str, Solid]) -> ElementLibrary:
         """Return the elements of ``self._mesh``."""
+
+    def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> LoadLibrary | None:
+        """Return the loads of ``self._mesh``, or None if there are none. Collective."""
+        return None
 
     @abstractmethod
     def near_null_space(self) -> list[np.ndarray]:
@@ -138,7 +109,7 @@ class NodalSolid(SolidField):
 
     # ---- set-up -----------------------------------------------------------------------------------------------
 
-    def _set_motion(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> None:
+    def _set_motion(self, mesh: SimplexMesh, solids: Mapping[str, Solid], dt: float) -> None:
         initial = {name: solid.initial for name, solid in solids.items()}
         mine = self._mesh.natural[: self._mesh.n_owned]
         moved = {name: ("displacement", start.displacement) for name, start in initial.items()}
@@ -151,13 +122,20 @@ class NodalSolid(SolidField):
         self._loaded: tuple[Stage, State, np.ndarray] | None = None
         self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
         self._past_dt = 0.0
-        self._prescribed = self._supports.velocities(0.0).copy()
+        self._prescribed = self._supports.initial_velocities(dt)
         held = self._supports.unknowns
         here = (held >= self.layout.start) & (held < self.layout.end)
         local = self.width * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.width)
         self._is_held = np.isin(local, held)
         self._loses = self._supports.move or bool(np.any(self._damping))
         self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
+        placed = self._supports.placed
+        here = here[placed]
+        self.displacement.reshape(-1)[held[placed][here] - self.layout.start] = self._supports.displacements(0.0)[here]
+
+    @cached_property
+    def _pattern(self) -> Pattern:
+        return Pattern.of(self._mesh, self.width)
 
     def _lump(self) -> LumpedEquation:
         damping = self._damping[self._node_body[self._mesh.natural[: self._mesh.n_owned]]]
@@ -169,7 +147,7 @@ class NodalSolid(SolidField):
         self.block = new_block(self.comm, self.layout, self.layout, block_size=self.width)
         rows: Pattern | LumpedEquation
         if self._lumped is None:
-            rows = self._pattern = Pattern.of(self._mesh, self.width)
+            rows = self._pattern
             self._elimination = Elimination(self._pattern, self.layout, self._supports.unknowns)
         else:
             rows = self._lumped
@@ -216,7 +194,9 @@ class NodalSolid(SolidField):
         state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
         self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
         self._loaded = stage, state, self._add_weight(time, dt)
-        self._prescribe(time, dt)
+        if self._loads is not None:
+            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, self._values, b)
+        self._prescribe(stage, time, dt)
         self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
         set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
         self.row_scale = dt / self._reference_mass
@@ -237,9 +217,11 @@ class NodalSolid(SolidField):
         self._elements.forces(state, b)
         b += lumped.mass * stage.inertia
         self._loaded = stage, state, self._add_weight(time, dt)
+        if self._loads is not None:
+            self._loads.assemble(time + self._integrator.moment(dt), state, 0.0, None, b)
         if self._loses:
             self._pull = b.copy()
-        self._prescribe(time, dt)
+        self._prescribe(stage, time, dt)
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
         if self._assembled_for != (stage.a, mean):
             self._assembled_for = stage.a, mean
@@ -318,9 +300,12 @@ class NodalSolid(SolidField):
             self._diagonal = (stage.a, stage.k), diagonal
         return diagonal
 
-    def _prescribe(self, time: float, dt: float) -> None:
-        instants = self._integrator.instants(dt)
+    def _prescribe(self, stage: Stage, time: float, dt: float) -> None:
+        instants, placed = self._integrator.instants(dt), self._supports.placed
         self._prescribed = np.mean([self._supports.velocities(time + t).copy() for t in instants], axis=0)
+        if len(placed):
+            there = self.comm, self.layout, self._integrator, self._motion()
+            self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)
 
     def _with_shared(self, owned: np.ndarray) -> np.ndarray:
         """Return values at all nodes of this rank's elements. Collective."""
@@ -344,25 +329,30 @@ class NodalSolid(SolidField):
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted.
 
-        Gravity acts along the way that nodes moved; damping (w . C w) and supports, with the reaction that is the
-        residual of their equations without other fields' forces, act at w for dt.
+        Gravity and loads act along the way that nodes moved; damping (w . C w) and supports, with the reaction that is
+        the residual of their equations without other fields' forces, act at w for dt.
         """
         if self._loaded is None:
             return Work()
         stage, state, gravity = self._loaded
         weight = np.tensordot(gravity, self._uniform, axes=1)
-        fallen = float(np.vdot(weight, self.moved))
-        if not self._loses:
+        fallen, loaded = float(np.vdot(weight, self.moved)), 0.0
+        if not self._loses and self._loads is None:
             return Work(gravity=fallen)
         w = self._with_shared(self._integrator.solved(self._motion()))
+        if self._loads is not None:
+            load = self._loads.felt(w)
+            loaded, weight = float(np.vdot(load, self.moved)), weight + load
+        if not self._loses:
+            return Work(gravity=fallen, loads=loaded)
         g = np.where(self._is_held, w, 0.0)
         if self._lumped is not None:
             lost, _ = self._elements.powers(state, 0.0, 0.0, w, np.zeros_like(w), self._mesh.counted)
             done = np.vdot(g[: self._mesh.n_owned], self._lumped.inertia(stage.a, w[: self._mesh.n_owned]) - self._pull)
-            return Work(fallen, dt * lost, dt * float(done))
+            return Work(fallen, dt * lost, dt * float(done), loaded)
         damping, power = self._elements.powers(state, stage.a, stage.k, w, g, self._mesh.counted)
         power -= float(np.vdot(weight, g[: self._mesh.n_owned]))
-        return Work(fallen, dt * damping, dt * power)
+        return Work(fallen, dt * damping, dt * power, loaded)
 
     def energies(self) -> dict[str, float]:
         """Return the kinetic and elastic energy of all bodies, J (per metre in 2D). Collective."""
@@ -403,6 +393,10 @@ def _shortest_edge(mesh: SimplexMesh) -> float:
     edges = corners[:, :, None] - corners[:, None]
     a, b = np.triu_indices(mesh.cells.shape[1], 1)
     return float(np.sqrt((edges[:, a, b] ** 2).sum(axis=-1).min()))
+
+
+def _tags(scene: Scene, solids: Mapping[str, Solid]) -> dict[str, Tags]:
+    return {name: read_tags(solid, scene.dim, f"solids.{name}", scene.directory) for name, solid in solids.items()}
 
 
 def _evaluate(
