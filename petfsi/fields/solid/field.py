@@ -160,7 +160,7 @@ class NodalSolid(SolidField):
             vectors.append(vector)
         self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
         self._diagonal = (0.0, 0.0), 1.0
-        self._assembled_for = 0.0, 0.0
+        self._assembled_for = 0.0, 0.0, 0.0, 0.0  # a, k, dt and the mass in row_scale
 
     def _set_exchange(self, mesh: SimplexMesh) -> None:
         """Prepare the messages between owned, shared and naturally ordered nodes."""
@@ -183,24 +183,32 @@ class NodalSolid(SolidField):
         self._geometry = self._stage.tangent_at
 
     def assemble(self, time: float, dt: float) -> None:
-        """Refresh A and b for the step from ``time`` to ``time + dt``. Collective."""
+        """Refresh A (only if it changes) and b for the step from ``time`` to ``time + dt``. Collective."""
         if self._lumped is not None:
             self._assemble_lumped(self._lumped, time, dt)
             return
         stage = self._stage or self._integrator.stage(self._motion(), dt)
         b = self.rhs.reshape(-1, self.width)
-        diagonal = self._mean_diagonal(stage)
         local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
         state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
-        self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
+        made_for = stage.a, stage.k, dt, self._reference_mass
+        values = None if self.is_linear and made_for == self._assembled_for else self._values
+        if values is None:  # A is still the same
+            self._elements.forces(state, b)
+        else:
+            diagonal = self._mean_diagonal(stage)
+            self._elements.assemble(state, stage.a, stage.k, self._pattern, values, b)
         self._loaded = stage, state, self._add_weight(time, dt)
         if self._loads is not None:
-            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, self._values, b)
+            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, values, b)
         self._prescribe(stage, time, dt)
-        self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
-        set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
+        if values is not None:
+            self._elimination.empty(values, diagonal)
+            set_csr(self.block, self._pattern.indptr, self._pattern.indices, values, new_pattern=False)
+            self._assembled_for = made_for
+            self.n_assembled += 1
+        self._elimination.prescribe(self.rhs, self._prescribed)
         self.row_scale = dt / self._reference_mass
-        self.n_assembled += 1
 
     def _assemble_lumped(self, lumped: LumpedEquation, time: float, dt: float) -> None:
         """Refresh the diagonal A only if the step's length has changed, and b. Collective."""
@@ -223,8 +231,8 @@ class NodalSolid(SolidField):
             self._pull = b.copy()
         self._prescribe(stage, time, dt)
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
-        if self._assembled_for != (stage.a, mean):
-            self._assembled_for = stage.a, mean
+        if self._assembled_for != (stage.a, 0.0, dt, mean):
+            self._assembled_for = stage.a, 0.0, dt, mean
             set_csr(self.block, lumped.indptr, lumped.indices, lumped.diagonal(stage.a, mean), new_pattern=False)
             self.n_assembled += 1
         self.row_scale = dt / mean
