@@ -24,7 +24,10 @@ density = 1100.0
 young = 1e6
 poisson = 0.3
 material = "green"
-supports = [{ where = "start", fix = ["x", "angle"], velocity = { angle = "0.1*t" } }, { where = "bottom", fix = ["y"] }]
+supports = [
+    { where = "start", fix = ["x", "angle"], velocity = { angle = "0.1*t" } },
+    { where = "bottom", fix = ["y"] },
+]
 initial = { velocity = [0.0, 0.0, "y"] }
 [probes.tip]
 of = "gate"
