@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from numba import njit
 
-#: The estimate is taken when it is known to this fraction, or after so many products.
+#: The estimate is taken when its residual is this fraction, or after so many products.
 TOLERANCE, PRODUCTS = 0.02, 40
 
 
@@ -83,8 +83,9 @@ def largest_eigenvalue(
 ) -> tuple[float, np.ndarray]:
     """Return the largest eigenvalue of M^-1 K and its vector, to ``TOLERANCE``, by Lanczos's method. Collective.
 
-    To the largest Ritz value is added the norm of its residual, within which an eigenvalue lies: what comes back is
-    too large rather than too small.
+    The largest Ritz value is taken once the norm of its residual, within which an eigenvalue lies, is a fraction
+    ``TOLERANCE`` of it, and raised by that: a Ritz value is never above the largest eigenvalue, and what comes back
+    should not be below it.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def largest_eigenvalue(
         value, residual = float(values[-1]), norm * abs(float(vectors[-1, -1]))
         if residual <= TOLERANCE * abs(value) or len(basis) == PRODUCTS:
             ritz = sum(weight * other for weight, other in zip(vectors[:, -1], basis, strict=True))
-            return value + residual, ritz / root
+            return value + max(residual, TOLERANCE * abs(value)), ritz / root
         beside.append(norm)
         q = r / norm
         basis.append(q)
