@@ -33,13 +33,15 @@ class Accounts:
         through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f dt.
     ``dissipated``
         What Rayleigh damping took so far, sum w . C w dt, with w where the integrator takes the forces.
+    ``load_work``
+        Of the solids' body forces and loads so far, along the way that nodes moved.
     ``boundary_work``
         What came in so far: the supports' reactions, the residual of their equations, times w dt; and through
         inflows and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow.
     ``energy_residual``
-        kinetic + elastic + potential + dissipated - boundary_work, less its initial value: what the scheme's own
-        damping took (negative) or gave, with advection, cuts that change and what linearising a step leaves out.
-        With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions.
+        kinetic + elastic + potential + dissipated - load_work - boundary_work, less its initial value: what the
+        scheme's own damping took (negative) or gave, with advection, cuts that change and what linearising a step
+        leaves out. With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions.
 
     Columns that a scene has no use for are left out, all of them if ``output.accounts`` is false.
 
@@ -67,8 +69,9 @@ class Accounts:
         self.comm, self.fields, self.couplings, self.regions = comm, fields, couplings, regions
         self.dim, self._wanted, self._heavy = scene.dim, scene.output.accounts, scene.gravity is not None
         self._elastic = any(isinstance(field, SolidField) for field in fields)
+        self._loaded = any(solid.loads or solid.body_force for solid in scene.solids.values())
         self._initial = 0.0
-        self._sums = np.zeros(3)
+        self._sums = np.zeros(4)
         self.values: dict[str, float] = {}
 
     @property
@@ -81,7 +84,7 @@ class Accounts:
         if self._wanted:
             self._sums[:] = 0.0
             self._initial = 0.0
-            self._enter(np.zeros(3))
+            self._enter(np.zeros(4))
             self._initial = self.values["energy_residual"]
             self.values["energy_residual"] = 0.0
 
@@ -99,7 +102,7 @@ class Accounts:
         parts = [field.work(dt) for field in self.fields]
         if pressure is not None:
             parts += [coupling.work(pressure, dt) for coupling in self.couplings]
-        self._enter(np.array([(-part.gravity, part.damping, part.boundary) for part in parts]).sum(axis=0))
+        self._enter(np.array([(-part.gravity, part.damping, part.loads, part.boundary) for part in parts]).sum(axis=0))
 
     def _enter(self, done: np.ndarray) -> None:
         """Add up this rank's shares: what was done in a step, and what the fields hold. Collective."""
@@ -107,14 +110,14 @@ class Accounts:
         share = np.concatenate([done, *([s.kinetic, s.elastic] for s in stocks), *(s.momentum for s in stocks)])
         total = np.empty_like(share)
         self.comm.Allreduce(share, total)
-        self._sums += total[:3]
+        self._sums += total[:4]
         n = len(stocks)
-        kinetic, elastic = total[3 : 3 + 2 * n].reshape(n, 2).sum(axis=0).tolist()
-        momentum = total[3 + 2 * n :].reshape(n, self.dim).sum(axis=0)
+        kinetic, elastic = total[4 : 4 + 2 * n].reshape(n, 2).sum(axis=0).tolist()
+        momentum = total[4 + 2 * n :].reshape(n, self.dim).sum(axis=0)
         self._write(kinetic, elastic, momentum)
 
     def _write(self, kinetic: float, elastic: float, momentum: np.ndarray) -> None:
-        potential, dissipated, boundary_work = self._sums.tolist()
+        potential, dissipated, load_work, boundary_work = self._sums.tolist()
         volumes = [] if self.regions is None else self.regions.volumes.tolist()
         self.values = {f"region_volume.{number}": volume for number, volume in enumerate(volumes, start=1)}
         self.values |= {f"momentum.{axis}": p for axis, p in zip("xyz", momentum.tolist(), strict=False)}
@@ -125,8 +128,10 @@ class Accounts:
             self.values["potential"] = potential
         if self._elastic:
             self.values["dissipated"] = dissipated
+        if self._loaded:
+            self.values["load_work"] = load_work
         self.values["boundary_work"] = boundary_work
-        held = kinetic + elastic + potential + dissipated - boundary_work
+        held = kinetic + elastic + potential + dissipated - load_work - boundary_work
         self.values["energy_residual"] = held - self._initial
 
     def state(self) -> dict[str, Slab]:
@@ -140,6 +145,7 @@ class Accounts:
         """Take up a state, after ``start``. Collective."""
         self.values = {name: float(read(name, (0,), (1,))[0]) for name in self.values}
         self._initial = float(read("initial_energy", (0,), (1,))[0])
-        self._sums[:] = [self.values.get(name, 0.0) for name in ("potential", "dissipated", "boundary_work")]
+        summed = ("potential", "dissipated", "load_work", "boundary_work")
+        self._sums[:] = [self.values.get(name, 0.0) for name in summed]
         if self.regions is not None and any(name.startswith("region_volume") for name in self.values):
             self.regions.restore(read)

@@ -12,7 +12,7 @@ from petfsi.scene.schema import Scene
 
 #: Where each kind of field and coupling lives; a new one is its file and a line here.
 FLUIDS = {"mac": "petfsi.fields.mac.fluid:MacFluid"}
-SOLIDS = {"simplex": "petfsi.fields.solid.solid:SimplexSolid"}
+SOLIDS = {"simplex": "petfsi.fields.solid.solid:SimplexSolid", "beam": "petfsi.fields.beam.beam:BeamSolid"}
 COUPLINGS = {
     "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
     "ray": "petfsi.couplings.ray:RayCoupling",
@@ -28,7 +28,8 @@ def build_fields(comm: MPI.Comm, scene: Scene) -> list[Field]:
     """Return the scene's fields, in the order of the nest: solid, pressure. Collective."""
     fields: list[Field] = []
     if scene.solids:
-        fields.append(_class(SOLIDS["simplex"])(comm, scene))
+        kind = "beam" if any(solid.shape.beam for solid in scene.solids.values()) else "simplex"
+        fields.append(_class(SOLIDS[kind])(comm, scene))
     if scene.fluid:
         fields.append(_class(FLUIDS[scene.fluid.kind])(comm, scene))
     return fields

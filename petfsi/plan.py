@@ -92,6 +92,10 @@ def skipped(scene: Scene) -> list[str]:
             out.append("obstacles: there are none")
         if not scene.solids:
             out.append("geometry after the first step: sides and obstacles do not move, the matrix stays")
+    if scene.time.integrator == "symplectic-euler" and scene.fluid is None:
+        out.append("solver: the mass is lumped, A is diagonal; no option under -fsi_ is read")
+    if scene.time.integrator == "static":
+        out.append("inertia: the integrator is static")
     if scene.gravity is None:
         out.append("gravity: not given")
     if scene.solids and all(s.damping.mass == 0 and s.damping.stiffness == 0 for s in scene.solids.values()):
@@ -109,7 +113,7 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
         unknowns += n
         rows.append(("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, scene.fluid.cells))}"))
     if nodes:
-        n = scene.dim * sum(nodes.values())
+        n = sum(count * (scene.dim if scene.solids[name].shape.beam is None else 3) for name, count in nodes.items())
         unknowns += n
         bodies = "; ".join(f"{name} {nodes[name]:,} nodes, {cells[name]:,} cells" for name in nodes)
         rows.append(("solid", f"{n:,} unknowns ({bodies})"))
@@ -149,6 +153,7 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     if len(boxes) == len(scene.solids) and not scene.obstacles:
         nodes = {name: math.prod(n + 1 for n in box) for name, box in boxes.items()}
         return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
+    from petfsi.geometry.beams import axis_mesh
     from petfsi.geometry.bodies import build_bodies
     from petfsi.geometry.meshes import read_surface
     from petfsi.geometry.obstacles import obstacle_surfaces
@@ -168,6 +173,8 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
             errors += [line for line in str(error).splitlines() if line not in errors]
     if errors:
         raise InputError("\n".join(errors))
+    beams = {name: solid.shape.beam for name, solid in scene.solids.items() if solid.shape.beam is not None}
+    meshes |= {name: axis_mesh(beam) for name, beam in beams.items()}
     return {n: len(points) for n, (points, _) in meshes.items()}, {n: len(cells) for n, (_, cells) in meshes.items()}
 
 

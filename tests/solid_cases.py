@@ -10,7 +10,7 @@ from petfsi.fields.solid.materials import MATERIALS, lame_parameters
 from petfsi.fields.solid.partition import distribute
 from petfsi.fields.solid.patches import grid_patches, grouped_mesh
 from petfsi.fields.solid.pattern import Pattern
-from petfsi.geometry.meshes import box_mesh
+from petfsi.geometry.meshes import SimplexMesh, box_mesh
 from petfsi.geometry.quadratic import with_middles
 from petfsi.scene.schema import Box, Scene
 
@@ -137,6 +137,12 @@ def elements_of(mesh, material="green", lame=LAME, mu=MU, lumped=False, volumetr
 
 def pattern_of(mesh):
     return Pattern.of(mesh, mesh.points.shape[1])
+
+
+def pattern_at(cells, n, width):
+    """Return the pattern of a mesh of ``n`` nodes on one rank."""
+    mesh = SimplexMesh(np.zeros((n, 2)), cells, np.zeros(len(cells), np.int32))
+    return Pattern.of(whole_mesh(mesh), width)
 
 
 def respond(elements, pattern, d, inertia=None, shift=None, a=0.0, k=1.0):

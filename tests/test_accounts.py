@@ -134,6 +134,46 @@ def test_supports_and_damping_are_entered_exactly(damping):
     assert np.abs(got["energy_residual"]).max() < 1e-5 * np.abs(got["boundary_work"]).max()
 
 
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("held", [False, True])
+def test_midpoint_keeps_the_energy_that_dead_loads_bring(held):
+    foot = {"where": "bottom", "fix": ["x", "y"], "velocity": {"y": "0.1*sin(30*t)"} if held else {}}
+    loads = [{"where": "right", "traction": [300.0, "1e3*y"]}, {"at": [0.1, 0.2], "force": [40.0, -20.0]}]
+    block = solid(
+        [0.0, 0.0], [0.3, 0.2], [4, 3], material="linear", supports=[foot], loads=loads, body_force=["1e3*x", 500.0]
+    )
+    got = history(scene("midpoint", gravity=[0.0, -9.81], solids={"block": block}), 60)
+    most = np.abs(got["load_work"]).max()
+    assert most > 0.01
+    assert np.any(got["boundary_work"] != 0.0) == held
+    assert np.abs(got["energy_residual"]).max() < 1e-11 * most
+    columns = list(got)
+    assert columns.index("load_work") == columns.index("boundary_work") - 1
+
+
+@pytest.mark.parallel([1, 2])
+def test_what_followers_and_timed_loads_do_is_entered_as_the_step_uses_it():
+    """The linear material leaves nothing out, so that what is left is what the tangents of the loads leave out."""
+    foot = {"where": "bottom", "fix": ["x", "y"], "displacement": {"x": "1e-4*sin(30*t)"}}
+    loads = [
+        {"where": "all", "pressure": "2e3*sin(20*t)"},
+        {"where": "right", "traction": ["100*t", 9.0], "follower": True},
+    ]
+    block = solid([0.0, 0.0], [0.3, 0.2], [4, 3], material="linear", supports=[foot], loads=loads)
+    got = history(scene("midpoint", solids={"block": block}), 60)
+    assert np.abs(got["boundary_work"]).max() > 1e-4 < np.abs(got["load_work"]).max()
+    assert np.abs(got["energy_residual"]).max() < 1e-11 * np.abs(got["load_work"]).max()
+
+
+def test_a_force_pays_for_what_it_throws():
+    block = solid([0.0, 0.0], [0.3, 0.2], [3, 2], body_force=["600*t", 0.0])
+    got = history(scene("midpoint", dt=0.01, solids={"block": block}), 10)
+    mass, speed = 800.0 * 0.06, 600.0 / 800.0 * 0.1**2 / 2
+    np.testing.assert_allclose(got["momentum.x"][-1], mass * speed, rtol=1e-9)
+    np.testing.assert_allclose(got["load_work"][-1], mass * speed**2 / 2, rtol=1e-9)
+    assert "load_work" not in history(scene(solids={"block": solid([0, 0], [0.3, 0.2], [1, 1])}), 1)
+
+
 def test_what_sinks_gains_what_its_weight_does():
     block = solid([0.31, 0.53], [0.3, 0.2], [4, 3]) | {"density": 2000.0}
     got = history(scene(gravity=[0.0, -9.81], fluid=fluid(), solids={"block": block}), 10)

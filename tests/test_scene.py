@@ -138,6 +138,11 @@ def ball(settings: str) -> str:
     return f"solids.layer.shape={{ball = {{{settings}}}}}"
 
 
+def load(settings: str) -> str:
+    """Return the setting that gives the layer one load."""
+    return f"solids.layer.loads=[{{{settings}}}]"
+
+
 #: Settings laid over a sound scene, the key that is wrong then, and words of what is allowed.
 BROKEN = [
     # one value at a time
@@ -176,15 +181,19 @@ BROKEN = [
     (["solids.layer.tangent=soft"], 'tangent = "soft"', "must be 'exact' or 'projected' (projected: without"),
     (["solids.layer.interior=air"], 'interior = "air"', "must be 'fluid' or 'void'"),
     (["solids.layer.supports.0.fix=[]"], "solids.layer.supports.0.fix = []", "must not be empty"),
-    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "must be 'x', 'y' or 'z'"),
-    (["solids.layer.supports.0.velocity={w = 1.0}"], "solids.layer.supports.0.velocity.w", "must be 'x', 'y' or 'z'"),
+    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "'x', 'y', 'z' or 'angle'"),
+    (
+        ["solids.layer.supports.0.velocity={w = 1.0}"],
+        "solids.layer.supports.0.velocity.w",
+        "must be 'x', 'y', 'z' or 'angle'",
+    ),
     (
         ["solids.layer.supports.0.where=under"],
         'where = "under"',
-        "'bottom', 'top', 'back', 'front' or 'all' (or a shape",
+        "'front', 'all', 'start' or 'end' (or a shape",
     ),
     (["obstacles.floor.outside='yes'"], 'obstacles.floor.outside = "yes"', "must be true or false"),
-    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'displacement', 'velocity', 'pressure' or"),
+    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'velocity', 'angle', 'pressure' or"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
     (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
     (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell' or 'ray'"),
@@ -314,6 +323,74 @@ BROKEN = [
         "belongs to fixed axes only; fix = ['x']",
     ),
     (["solids.layer.supports.0.where={mesh='a.stl'}"], "supports.0.where.mesh", "must be a box, ball"),
+    (["solids.layer.supports.0.where={tag='foot'}"], 'where.tag = "foot"', "a tag is a mesh file's, and the solid's"),
+    (["solids.layer.supports.0.where={tag=1}"], "supports.0.where.tag = 1", "must be a text in quotes (the name of a"),
+    (["solids.layer.supports.0.where={tag=''}"], 'supports.0.where.tag = ""', "must not be empty"),
+    (
+        ["solids.layer.supports.0.displacement={x = 1.0}"],
+        "displacement.x = 1.0",
+        "the axis has a velocity too; give one",
+    ),
+    (
+        ["solids.layer.supports.1.displacement={y = 1.0}"],
+        "displacement.y = 1.0",
+        "a displacement belongs to fixed axes",
+    ),
+    (
+        ["solids.layer.supports.0.displacement={w = 1.0}"],
+        "supports.0.displacement.w",
+        "must be 'x', 'y', 'z' or 'angle'",
+    ),
+    (["solids.layer.supports.1.displacement={x = 'q'}"], 'displacement.x = "q"', "unknown name 'q'"),
+    # loads
+    (["solids.layer.body_force=[1.0]"], "solids.layer.body_force = [1.0]", "must have 2 items"),
+    (["solids.layer.body_force=[1.0, 'z']"], 'solids.layer.body_force.1 = "z"', "known are x, y, t, pi, e"),
+    (
+        ["solids.layer.body_force=[true, 1.0]"],
+        "body_force.0 = true",
+        "must be a number or an expression in quotes (N/m^3",
+    ),
+    (
+        ["solids.layer.loads=[{}]"],
+        "solids.layer.loads.0",
+        "must have exactly one of traction, pressure (both with where)",
+    ),
+    (
+        [load("where = 'top', pressure = 1.0, traction = [0.0, 1.0]")],
+        'loads.0 = "traction, pressure"',
+        "exactly one of",
+    ),
+    ([load("where = 'top'")], "solids.layer.loads.0", "must have exactly one of traction, pressure"),
+    ([load("pressure = 1.0")], "solids.layer.loads.0.where", "is missing; a pressure needs it"),
+    ([load("at = [0.5, 0.5], where = 'top', force = [1.0, 1.0]")], "loads.0.where", "a force has at instead"),
+    ([load("where = 'top', force = [1.0, 1.0]")], "loads.0.where", "a force has at instead"),
+    ([load("force = [1.0, 1.0]")], "loads.0.at", "is missing; a force needs it"),
+    ([load("where = 'top', pressure = 'q'")], 'loads.0.pressure = "q"', "unknown name 'q'"),
+    ([load("where = 'top', pressure = inf")], "loads.0.pressure = inf", "must be a finite number (Pa"),
+    ([load("where = 'top', traction = [1.0]")], "loads.0.traction = [1.0]", "must have 2 items"),
+    ([load("where = 'top', traction = [1.0, 'z']")], 'loads.0.traction.1 = "z"', "known are x, y, t, pi, e"),
+    (
+        [load("where = 'top', pressure = 1.0, follower = 1")],
+        "loads.0.follower = 1",
+        "must be true or false (whether it",
+    ),
+    ([load("at = [0.5, 0.5], force = [1.0, 1.0], follower = true")], "loads.0.follower = true", "keeps its direction"),
+    ([load("at = [0.5], force = [1.0, 1.0]")], "loads.0.at = [0.5]", "must have 2 items"),
+    ([load("at = [0.5, 0.5], force = [1.0]")], "loads.0.force = [1.0]", "must have 2 items"),
+    ([load("at = [0.5, 0.5], force = [1.0, 'x*']")], 'loads.0.force.1 = "x*"', "is not an expression"),
+    ([load("where = 'front', pressure = 1.0")], 'loads.0.where = "front"', "bounds z, which dim = 2 does not have"),
+    (
+        [load("where = 'under', pressure = 1.0")],
+        'loads.0.where = "under"',
+        "'all', 'start' or 'end' (or a shape such as",
+    ),
+    ([load("where = { tag = 'lid' }, pressure = 1.0")], 'loads.0.where.tag = "lid"', "a tag is a mesh file's"),
+    ([load("where = { mesh = 'a.stl' }, pressure = 1.0")], "loads.0.where.mesh", "must be a box, ball, cylinder or"),
+    (
+        ["probes.load_work={of='fluid', at=[0.5, 1.0], quantity='pressure'}"],
+        "probes.load_work",
+        "is a column of history",
+    ),
     # names and probes
     (["probes.9a={of='fluid', at=[0.5, 1.0], quantity='pressure'}"], "probes.9a", "a name must be made of letters"),
     (["solids.a-b=1"], "solids.a-b = 1", "must be a table"),
@@ -440,7 +517,7 @@ def test_a_report_fits_on_a_screen():
         scene_from_dict(data)
     lines = str(caught.value).splitlines()
     assert lines[0] == "scene: 60 mistakes" and lines[-1] == "  and 20 more" and len(lines) == 42
-    long = mistakes(layer(f"time.integrator={'x' * 500}"))[0]
+    long = mistakes(layer(f"fluid.advection={'x' * 500}"))[0]
     assert len(long) < 120
 
 

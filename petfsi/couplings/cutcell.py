@@ -11,6 +11,7 @@ from scipy.sparse import csr_matrix
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.blocks import TransferBlocks
 from petfsi.fields.base import SolidField, Work
+from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_triplets
 from petfsi.scene import schema
 
@@ -33,17 +34,20 @@ class CutCellCoupling(Coupling):
         self.fluid, self.solid = fluid, solid
         self.comm: MPI.Comm = fluid.comm
         self.dim = fluid.dim
-        self.surface = solid.surface()
+        self._take(solid.surface())
         # a cavity that holds nothing is no room for the fluid: without its walls it counts as solid
         self.facets = self.surface.facets[~self.surface.void]
-        # the surface's own unknowns alone, so that no product runs over all of the solid's
-        self._free = np.unique(self.surface.point_map.indices)
-        self._free_map = self.surface.point_map[:, self._free]
         self._new_blocks()
         self._positions: np.ndarray | None = None
         self._stale, self._dt = False, 0.0
         self._held = np.zeros(self.surface.point_map.shape[0])
         self._held_outflow = np.zeros(0)
+
+    def _take(self, surface: Surface) -> None:
+        self.surface = surface
+        # the surface's own unknowns alone, so that no product runs over all of the solid's
+        self._free = np.unique(surface.point_map.indices)
+        self._free_map = surface.point_map[:, self._free]
 
     def _new_blocks(self) -> None:
         self._made_for = self.fluid.block
@@ -53,9 +57,11 @@ class CutCellCoupling(Coupling):
 
     def couple(self, time: float, dt: float) -> None:
         """Cut the grid and make J; nothing if no point moved."""
-        positions = self.solid.surface_positions()
-        if self._positions is not None and np.array_equal(positions, self._positions):
+        positions, surface = self.solid.surface_positions(), self.solid.surface()
+        if self._positions is not None and surface is self.surface and np.array_equal(positions, self._positions):
             return
+        if surface is not self.surface:
+            self._take(surface)
         self._positions = positions.copy()
         walls, wet = self.fluid.cut(positions, self.facets)
         layout = self.fluid.layout
@@ -105,6 +111,10 @@ class CutCellCoupling(Coupling):
             self.fluid.rhs -= self._held_outflow
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
+
+    def rewind(self) -> None:
+        """Make the operators anew, and the fluid's cells with them, in the next step."""
+        self._positions = None
 
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return the work of the fluid's weight on all points, and what supports do against it and the pressure."""

@@ -15,6 +15,7 @@ from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.kinds import FLUID, SOLID, SOLID_FACE, VOID
 from petfsi.geometry import rays
+from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_triplets
 from petfsi.scene import schema
 
@@ -49,11 +50,8 @@ class RayCoupling(Coupling):
         self.comm: MPI.Comm = self.grid.comm
         self.dim = self.grid.dim
         self.box = Box.of(self.grid)
-        self.surface = solid.surface()
+        self._take(solid.surface())
         self.wet = np.flatnonzero(~self.surface.void)
-        # the surface's own unknowns alone, so that no product runs over all of the solid's
-        self._free = np.unique(self.surface.point_map.indices)
-        self._free_map = self.surface.point_map[:, self._free]
         self._transfer = TransferBlocks(self.comm, fluid, solid)
         self.flux_block, self.force_block = self._transfer.flux, self._transfer.force
         self.blocks = self._transfer.by_name
@@ -64,13 +62,21 @@ class RayCoupling(Coupling):
         self._stale, self._dt = False, 0.0
         self._held_outflow = np.zeros(0)
 
+    def _take(self, surface: Surface) -> None:
+        self.surface = surface
+        # the surface's own unknowns alone, so that no product runs over all of the solid's
+        self._free = np.unique(surface.point_map.indices)
+        self._free_map = surface.point_map[:, self._free]
+
     # ---- couple ---------------------------------------------------------------------------------------------
 
     def couple(self, time: float, dt: float) -> None:
         """Find the cells and faces that the solid takes, and make D1 H and J; nothing if no point moved."""
-        positions = self.solid.surface_positions()
-        if self._positions is not None and np.array_equal(positions, self._positions):
+        positions, surface = self.solid.surface_positions(), self.solid.surface()
+        if self._positions is not None and surface is self.surface and np.array_equal(positions, self._positions):
             return
+        if surface is not self.surface:
+            self._take(surface)
         self._positions = positions.copy()
         shifts = self._images(positions)
         hits = self._immerse(positions, shifts)
@@ -217,6 +223,10 @@ class RayCoupling(Coupling):
         if self.surface.fixed_map.nnz:
             self._held_outflow = self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
             self.fluid.rhs -= self._held_outflow
+
+    def rewind(self) -> None:
+        """Make the operators anew, and the fluid's cells with them, in the next step."""
+        self._positions = None
 
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return what supports do against the pressure, as the fluid feels it."""

@@ -9,17 +9,13 @@ import numpy as np
 from numba import njit
 
 from petfsi.errors import InputError
+from petfsi.geometry.beams import axis_mesh
 from petfsi.geometry.meshes import build_mesh, read_surface
+from petfsi.geometry.places import Tags, located, located_facets, read_tags
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.scene.checks import check_inside_grid
-from petfsi.scene.schema import Obstacle, Scene, Solid, Support
-
-#: Nodes this far from a side of the bounding box, as a fraction of its size, lie on it (files may hold single
-#: precision).
-TOLERANCE = 1e-6
-
-_SIDES = {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1), "back": (2, 0), "front": (2, 1)}
+from petfsi.scene.schema import Obstacle, Scene, Solid
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -34,57 +30,65 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
         an obstacle or in another body.
     """
     meshes: dict[str, Mesh] = {}
+    clamped: dict[str, np.ndarray] = {}
     mistakes: list[str] = []
     for name, solid in scene.solids.items():
         key = f"solids.{name}"
         try:
             mesh = build_mesh(solid, scene.dim, key, scene.directory)
             check_inside_grid(scene, f"{key}.shape", mesh[0])
-            for n, support in enumerate(solid.supports):
-                supported(support, mesh[0], f"{key}.supports.{n}")
-            meshes[name] = mesh
+            tags = read_tags(solid, scene.dim, key, scene.directory)
+            nowhere = _places(solid, mesh, key, tags)
+            mistakes += nowhere
+            if not nowhere:
+                clamped[name] = _clamped(solid, mesh[0], tags)
+                meshes[name] = mesh
         except InputError as error:
             mistakes.append(str(error))
-    mistakes += _in_obstacles(scene, meshes)
+    mistakes += _in_obstacles(scene, meshes, clamped)
     mistakes += _in_each_other(meshes)
     if mistakes:
         raise InputError("\n".join(mistakes))
     return meshes
 
 
-def supported(support: Support, points: np.ndarray, key: str) -> np.ndarray:
-    """Return which reference points of one body a support holds.
+def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
+    """Return a sentence for every support and every load that finds nothing to act on."""
+    points, cells = mesh
+    mistakes = []
+    for n, support in enumerate(solid.supports):
+        try:
+            located(support.where, _held_points(solid, points), f"{key}.supports.{n}", tags)
+        except InputError as error:
+            mistakes.append(str(error))
+    facets = boundary_facets(points, cells) if solid.loads else cells[:0, :-1]
+    for n, load in enumerate(solid.loads):
+        try:
+            if load.where is not None:
+                located_facets(load.where, points, facets, f"{key}.loads.{n}", tags)
+        except InputError as error:
+            mistakes.append(str(error))
+    return mistakes
 
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    if not isinstance(support.where, str):
-        held = inside(support.where, points)
-    elif support.where == "all":
-        held = np.ones(len(points), dtype=bool)
-    else:
-        axis, end = _SIDES[support.where]
-        lower, upper = points.min(axis=0), points.max(axis=0)
-        side = (lower, upper)[end][axis]
-        held = np.abs(points[:, axis] - side) <= TOLERANCE * (upper - lower).max()
-    if not held.any():
-        lower, upper = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-        raise InputError(f"{key}.where: no node of the solid lies there; its nodes reach from {lower} to {upper} m")
-    return held
+
+def _held_points(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """Return what supports hold: the points of a mesh, of a beam those of its axis."""
+    return points if solid.shape.beam is None else axis_mesh(solid.shape.beam)[0]
 
 
 # ---- apart from each other ----------------------------------------------------------------------------------
 
 
-def _in_obstacles(scene: Scene, meshes: dict[str, Mesh]) -> list[str]:
-    """Return a sentence for every body in an obstacle; it is tested where the cells have their centres."""
+def _in_obstacles(scene: Scene, meshes: dict[str, Mesh], clamped: dict[str, np.ndarray]) -> list[str]:
+    """Return a sentence for every body in an obstacle; it is tested where the cells have their centres.
+
+    Cells at ``clamped`` nodes may reach in.
+    """
     found = []
     for obstacle_name, obstacle in scene.obstacles.items():
         try:
             for name, (points, cells) in meshes.items():
-                free = cells[~_clamped(scene.solids[name], points)[cells].any(axis=1)]
+                free = cells[~clamped[name][cells].any(axis=1)]
                 centres = points[free].mean(axis=1)
                 key = f"obstacles.{obstacle_name}.shape"
                 count = np.count_nonzero(_covers(obstacle, centres, scene, key))
@@ -98,14 +102,16 @@ def _in_obstacles(scene: Scene, meshes: dict[str, Mesh]) -> list[str]:
     return found
 
 
-def _clamped(solid: Solid, points: np.ndarray) -> np.ndarray:
-    """Return which nodes are held on all axes, as those in a wall are."""
-    held = np.zeros(points.shape, dtype=bool)
+def _clamped(solid: Solid, points: np.ndarray, tags: Tags) -> np.ndarray:
+    """Return which points are held on all axes (of a beam those at nodes that do not turn either), as in a wall."""
+    components = "xyz"[: points.shape[1]] if solid.shape.beam is None else ("x", "y", "angle")
+    nodes = _held_points(solid, points)
+    held = np.zeros((len(nodes), len(components)), dtype=bool)
     for support in solid.supports:
-        where = supported(support, points, "supports")
-        for axis in support.fix:
-            held[where, "xyz".index(axis)] = True
-    return held.all(axis=1)
+        where = located(support.where, nodes, "supports", tags)
+        for component in support.fix:
+            held[where, components.index(component)] = True
+    return np.repeat(held.all(axis=1), len(points) // len(nodes))
 
 
 def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> np.ndarray:

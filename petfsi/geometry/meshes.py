@@ -9,15 +9,20 @@ import math
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
+from petfsi.geometry.beams import strip_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.scene.schema import Box, Shape, Solid
+
+if TYPE_CHECKING:
+    import meshio
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +31,8 @@ FLAT = 1e-12
 #: Points coincide within this fraction of the mesh's extent.
 COINCIDENT = 1e-10
 
-_CELL_TYPE = {2: "triangle", 3: "tetra"}
-_FACET_TYPE = {2: "line", 3: "triangle"}
+CELL_TYPE = {2: "triangle", 3: "tetra"}
+FACET_TYPE = {2: "line", 3: "triangle"}
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
     Parameters
     ----------
     solid : Solid
-        The table; its shape is a box or a ball with cells, or a mesh file.
+        The table; its shape is a box or a ball with cells, a beam (then its strip is meshed), or a mesh file.
     dim : int
         2 for triangles, 3 for tetrahedra.
     key : str
@@ -115,6 +120,8 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
         points, cells = read_mesh(shape, dim, key, directory)
         _check(points, cells, f"{key} = {shape.mesh!r}")
         return points, cells
+    if shape.beam is not None:
+        return strip_mesh(shape.beam)
     if shape.ball is not None and shape.ball.cells is not None:
         return ball_mesh(shape.ball, dim)
     if shape.box is None or shape.box.cells is None:
@@ -160,7 +167,7 @@ def box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:
 
 def read_mesh(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return points and cells of a mesh file, scaled and moved, unused points dropped. Not collective."""
-    points, cells = _read(shape, dim, _CELL_TYPE[dim], key, directory)
+    points, cells = _read(shape, dim, CELL_TYPE[dim], key, directory)
     n_points = len(points)
     points, cells = _drop_unused(points, cells)
     if len(points) < n_points:
@@ -186,7 +193,7 @@ def read_surface(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.
     directory : Path
         What the path is relative to.
     """
-    points, facets = _read(shape, dim, _FACET_TYPE[dim], f"{key}.mesh", directory)
+    points, facets = _read(shape, dim, FACET_TYPE[dim], f"{key}.mesh", directory)
     where = f"{key}.mesh = {shape.mesh!r}"
     points, merged = np.unique(points, axis=0, return_inverse=True)
     facets = merged.ravel()[facets]
@@ -204,8 +211,8 @@ def read_surface(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.
     return _drop_unused(points, facets if volume > 0 else facets[:, ::-1])
 
 
-def _read(shape: Shape, dim: int, cell_type: str, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the cells of one type; whatever a reader does to say no becomes one InputError."""
+def open_mesh(shape: Shape, key: str, directory: Path) -> meshio.Mesh:
+    """Return what meshio reads; whatever a reader does to say no becomes one InputError. Not collective."""
     import meshio
 
     path = Path(directory) / str(shape.mesh)
@@ -214,11 +221,16 @@ def _read(shape: Shape, dim: int, cell_type: str, key: str, directory: Path) -> 
     try:
         # on a broken file some readers print, warn or even exit
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            mesh = meshio.read(path)
+            return meshio.read(path)
     except (Exception, SystemExit) as error:
         raise InputError(
             f"{key} = {shape.mesh!r}: cannot be read as a mesh ({error or type(error).__name__})"
         ) from error
+
+
+def _read(shape: Shape, dim: int, cell_type: str, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return points, scaled and moved, and the cells of one type."""
+    mesh = open_mesh(shape, key, directory)
     blocks = [block.data for block in mesh.cells if block.type == cell_type and len(block.data)]
     if not blocks:
         found = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells at all"

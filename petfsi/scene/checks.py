@@ -12,10 +12,14 @@ from itertools import combinations
 import numpy as np
 
 from petfsi.errors import InputError
+from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
+from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Fluid, Halfspace, InflowSide, Probe, Scene, Shape, Solid
+from petfsi.scene.schema import Fluid, Halfspace, InflowSide, Probe, Scene, Solid
 from petfsi.scene.shape_checks import (
+    NO_Z,
+    OPPOSITE,
     SLACK,
     Problems,
     analytic_shape,
@@ -31,13 +35,12 @@ from petfsi.scene.stepping import Stepping
 
 MAX_STEPS = 10**8
 
-OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
 SOLID_QUANTITIES = ("displacement", "velocity")
-NO_Z = "bounds z, which dim = 2 does not have"
 #: Columns of history.csv, which a probe must not repeat.
 RESERVED_PROBES = (
-    "step", "time", "dt", "iterations", "residual", "volume_error", "divergence", "region_volume", "momentum",
-    "kinetic", "elastic", "potential", "dissipated", "boundary_work", "energy_residual",
+    "step", "time", "dt", "iterations", "residual", "newton", "substeps", "volume_error", "divergence",
+    "region_volume", "momentum", "kinetic", "elastic", "potential", "dissipated", "load_work", "boundary_work",
+    "energy_residual",
 )  # fmt: skip
 
 
@@ -92,6 +95,24 @@ def _time(scene: Scene) -> Problems:
     elif stepping.constant and not time.end / dt <= MAX_STEPS:
         allowed = f"makes {time.end / dt:.3g} steps to time.end = {time.end:g} s; at most {MAX_STEPS:.0e} may be"
         yield Problem("time.dt", time.dt, allowed, ("time.end",))
+
+
+def _static(scene: Scene) -> Problems:
+    """Refuse what has no meaning where nothing moves by itself."""
+    if scene.time.integrator != "static":
+        return
+    uses = ("time.integrator",)
+    if scene.fluid is not None:
+        yield Problem("time.integrator", "static", "finds the equilibrium of solids; take out the [fluid]", ("fluid",))
+    for name, solid in scene.solids.items():
+        key = f"solids.{name}"
+        if solid.initial.velocity is not None:
+            allowed = "nothing has a velocity in statics: leave it out"
+            yield Problem(f"{key}.initial.velocity", solid.initial.velocity, allowed, uses)
+        for kind in ("mass", "stiffness"):
+            if getattr(solid.damping, kind) != 0:
+                allowed = "nothing is damped in statics: leave it out, or 0"
+                yield Problem(f"{key}.damping.{kind}", getattr(solid.damping, kind), allowed, uses)
 
 
 # ---- fluid --------------------------------------------------------------------------------------------------
@@ -174,30 +195,44 @@ def _solids(scene: Scene) -> Problems:
     for name, solid in scene.solids.items():
         key = f"solids.{name}"
         yield from solid_shape(f"{key}.shape", solid.shape, scene.dim)
-        yield from length(f"{key}.initial.velocity", solid.initial.velocity, scene.dim)
-        yield from length(f"{key}.initial.displacement", solid.initial.displacement, scene.dim)
+        yield from _initial(key, solid, scene.dim)
         yield from _supports(key, solid, scene.dim)
-        corners = extent(solid.shape, scene.dim)
-        if scene.fluid is not None and corners is not None:
-            yield from _outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *corners)
+        yield from solid_loads(key, solid, scene.dim)
+        beam = solid.shape.beam
+        if beam is not None:
+            yield from beam_shape(f"{key}.shape.beam", beam, scene.dim)
+        reach = corners(beam) if beam and is_sound(beam, scene.dim) else extent(solid.shape, scene.dim)
+        if scene.fluid is not None and reach is not None:
+            yield from _outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *reach)
     yield from _overlaps(scene)
+    yield from beams(scene)
+
+
+def _initial(key: str, solid: Solid, dim: int) -> Problems:
+    for name in ("velocity", "displacement"):
+        given = getattr(solid.initial, name)
+        if solid.shape.beam is None or given is None or len(given) != dim + 1:
+            yield from length(f"{key}.initial.{name}", given, dim)
 
 
 def _supports(key: str, solid: Solid, dim: int) -> Problems:
     for n, support in enumerate(solid.supports):
         here = f"{key}.supports.{n}"
-        if isinstance(support.where, Shape):
-            yield from analytic_shape(f"{here}.where", support.where, dim)
-        elif support.where in OPPOSITE[2] and dim == 2:
-            yield Problem(f"{here}.where", support.where, NO_Z, ("dim",))
+        yield from place(f"{here}.where", support.where, f"{key}.shape", solid.shape, dim)
         if "z" in support.fix and dim == 2:
             yield Problem(f"{here}.fix", support.fix, "must be out of x, y, as dim = 2", ("dim",))
+        if "angle" in support.fix and solid.shape.beam is None:
+            yield Problem(f"{here}.fix", support.fix, "only a beam has an angle", (f"{key}.shape",))
         if len(set(support.fix)) < len(support.fix):
             yield Problem(f"{here}.fix", support.fix, "names an axis twice")
-        for axis in support.velocity:
-            if axis not in support.fix:
-                allowed = f"a velocity belongs to fixed axes only; fix = {support.fix}"
-                yield Problem(f"{here}.velocity.{axis}", support.velocity[axis], allowed, (f"{here}.fix",))
+        for quantity in ("velocity", "displacement"):
+            for axis, value in getattr(support, quantity).items():
+                if axis not in support.fix:
+                    allowed = f"a {quantity} belongs to fixed axes only; fix = {support.fix}"
+                    yield Problem(f"{here}.{quantity}.{axis}", value, allowed, (f"{here}.fix",))
+        for axis in support.displacement.keys() & support.velocity.keys():
+            allowed = "the axis has a velocity too; give one of the two"
+            yield Problem(f"{here}.displacement.{axis}", support.displacement[axis], allowed, (f"{here}.velocity",))
 
 
 def _outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
@@ -238,8 +273,10 @@ def _probes(scene: Scene) -> Problems:
         elif probe.of not in scene.solids:
             known = ", ".join([*(["fluid"] if scene.fluid else []), *scene.solids]) or "fluid, or a solid's name"
             yield Problem(f"{key}.of", probe.of, f"must be one of {known}", (f"solids.{probe.of}",))
-        elif probe.quantity not in SOLID_QUANTITIES:
-            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}"
+        elif probe.quantity == "angle" and scene.solids[probe.of].shape.beam is None:
+            yield Problem(f"{key}.quantity", probe.quantity, "only a beam has an angle", (f"{key}.of",))
+        elif probe.quantity not in (*SOLID_QUANTITIES, "angle"):
+            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}, a beam an angle, too"
             yield Problem(f"{key}.quantity", probe.quantity, allowed, (f"{key}.of",))
 
 
@@ -248,7 +285,7 @@ def _fluid_probe(scene: Scene, key: str, probe: Probe) -> Problems:
     if fluid is None:
         yield Problem(f"{key}.of", "fluid", f"the scene has no [fluid], only {', '.join(scene.solids)}", ("fluid",))
         return
-    if probe.quantity == "displacement":
+    if probe.quantity in ("displacement", "angle"):
         yield Problem(f"{key}.quantity", probe.quantity, "a fluid has velocity, pressure and smoke", (f"{key}.of",))
     if probe.quantity == "smoke" and fluid.smoke is None:
         yield Problem(f"{key}.quantity", "smoke", "the fluid has no [fluid.smoke]", (f"{key}.of", "fluid.smoke"))
@@ -280,9 +317,17 @@ def expressions(scene: Scene) -> Iterator[tuple[str, float | str, tuple[str, ...
     for name, solid in scene.solids.items():
         yield from each(f"solids.{name}.initial.velocity", solid.initial.velocity, space)
         yield from each(f"solids.{name}.initial.displacement", solid.initial.displacement, space)
+        yield from each(f"solids.{name}.body_force", solid.body_force, (*space, "t"))
         for n, support in enumerate(solid.supports):
-            for axis, value in support.velocity.items():
-                yield f"solids.{name}.supports.{n}.velocity.{axis}", value, (*space, "t")
+            for quantity in ("velocity", "displacement"):
+                for axis, value in getattr(support, quantity).items():
+                    yield f"solids.{name}.supports.{n}.{quantity}.{axis}", value, (*space, "t")
+        for n, load in enumerate(solid.loads):
+            key = f"solids.{name}.loads.{n}"
+            yield from each(f"{key}.traction", load.traction, (*space, "t"))
+            yield from each(f"{key}.force", load.force, (*space, "t"))
+            if load.pressure is not None:
+                yield f"{key}.pressure", load.pressure, (*space, "t")
 
 
 def _expressions(scene: Scene) -> Problems:
@@ -298,6 +343,7 @@ CHECKS: tuple[Callable[[Scene], Problems], ...] = (
     _contents,
     _names,
     _time,
+    _static,
     _fluid,
     _sides,
     _solids,

@@ -106,7 +106,7 @@ def _allowed(entry: Mapping[str, Any]) -> str:
             return f"must be {context['le']:g} or less"
         case "multiple_of":
             return f"must be a multiple of {context['multiple_of']:g}"
-        case "too_short":
+        case "too_short" | "string_too_short":
             return "must not be empty"
     return entry["msg"]
 
@@ -190,6 +190,7 @@ _STAND_IN: dict[str, Any] = {
     "quantity": "velocity",
     "where": "all",
     "fix": ["x"],
+    "tag": "facets",
 }
 _VECTORS = ("origin", "size", "cells", "centre", "start", "point", "normal", "at")
 

@@ -43,8 +43,8 @@ Vector = list[Real]
 Cells = list[Annotated[Whole, Field(ge=1)]]
 #: A number, or an expression of x, y, z, t and pi (see ``expressions.py``).
 Number = Annotated[float | str, BeforeValidator(_number_or_text)]
-Axis = Literal["x", "y", "z"]
-Place = Literal["left", "right", "bottom", "top", "back", "front", "all"]
+Component = Literal["x", "y", "z", "angle"]
+Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
 
 
 class Table(BaseModel):
@@ -58,7 +58,11 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Number, Field(description="s")]
-    integrator: Literal["newmark", "bdf2", "midpoint"] = "newmark"
+    integrator: Literal["newmark", "bdf2", "midpoint", "symplectic-euler", "static"] = "newmark"
+    above_limit: Annotated[
+        Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
+    ] = "refuse"
+    retries: Annotated[Whole, Field(ge=0, le=20, description="how often a step that fails is halved")] = 3
 
     @field_validator("dt")
     @classmethod
@@ -102,6 +106,16 @@ class Halfspace(Table):
     normal: Vector
 
 
+class Beam(Table):
+    """A straight beam between two points (2D only), its faces half a thickness on either side."""
+
+    start: Annotated[Vector, Field(description="m")]
+    end: Annotated[Vector, Field(description="m")]
+    thickness: Annotated[Real, Field(gt=0, description="m")]
+    elements: Annotated[Whole, Field(ge=1, description="along the beam")]
+    theory: Literal["timoshenko", "euler-bernoulli"] = "timoshenko"
+
+
 class Shape(Table):
     """Exactly one of the shapes; ``mesh`` is a file that meshio reads, relative to the scene."""
 
@@ -109,6 +123,7 @@ class Shape(Table):
     ball: Ball | None = None
     cylinder: Cylinder | None = None
     halfspace: Halfspace | None = None
+    beam: Beam | None = None
     mesh: Annotated[str | None, Field(description="a file that meshio reads")] = None
     scale: Annotated[Real, Field(gt=0, description="factor on a mesh file's coordinates")] = 1.0
     translate: Annotated[Vector | None, Field(description="m, applied to a mesh file after scaling")] = None
@@ -127,7 +142,8 @@ class Shape(Table):
     @property
     def kinds(self) -> list[str]:
         """Which shapes are given; a valid shape names one."""
-        return [kind for kind in ("box", "ball", "cylinder", "halfspace", "mesh") if getattr(self, kind) is not None]
+        kinds = ("box", "ball", "cylinder", "halfspace", "beam", "mesh")
+        return [kind for kind in kinds if getattr(self, kind) is not None]
 
 
 # ---- fluid --------------------------------------------------------------------------------------------------
@@ -217,23 +233,60 @@ class Damping(Table):
     stiffness: Annotated[Real, Field(ge=0, description="s")] = 0.0
 
 
+class Tagged(Table):
+    """A group of boundary facets that a mesh file has a name (or a number) for."""
+
+    tag: Annotated[str, Field(min_length=1, description="the name of a group of facets in the mesh file")]
+
+
 def _where_form(value: Any) -> str:
+    if isinstance(value, Tagged) or (isinstance(value, dict) and "tag" in value):
+        return "<tag>"
     return "<table>" if isinstance(value, dict | Shape) else "<name>"
 
 
+#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, a shape or a mesh file's tag.
+Where = Annotated[
+    Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")] | Annotated[Tagged, Tag("<tag>")],
+    Discriminator(_where_form),
+]
+_WHERE = "or a shape such as { box = { origin = ..., size = ... } }, or { tag = ... } of a mesh file"
+
+
 class Support(Table):
-    """Nodes whose motion is prescribed.
+    """Nodes whose motion is prescribed: at rest, unless a velocity or a displacement is given."""
 
-    ``where`` is a side of the solid's bounding box (left, right, bottom, top, back, front, all) or a shape.
-    """
+    where: Annotated[Where, Field(description=_WHERE)]
+    fix: Annotated[list[Component], Field(min_length=1, description="axes that are held; of a beam its angle, too")]
+    velocity: Annotated[
+        dict[Component, Number], Field(description="m/s of fixed axes, rad/s; may depend on x, y, z, t")
+    ] = {}
+    displacement: Annotated[
+        dict[Component, Number], Field(description="m of fixed axes, rad; may depend on x, y, z, t")
+    ] = {}
 
-    where: Annotated[
-        Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")],
-        Discriminator(_where_form),
-        Field(description="or a shape such as { box = { origin = ..., size = ... } }"),
-    ]
-    fix: Annotated[list[Axis], Field(min_length=1, description="axes that are held")]
-    velocity: Annotated[dict[Axis, Number], Field(description="m/s of fixed axes; may depend on x, y, z, t")] = {}
+
+class Load(Table):
+    """A traction or a pressure on boundary facets, or a force at a point. x, y, z are reference positions."""
+
+    where: Annotated[Where | None, Field(description=_WHERE)] = None
+    traction: Annotated[list[Number] | None, Field(description="N/m^2 of reference area; may depend on x, y, z, t")] = (
+        None
+    )
+    pressure: Annotated[Number | None, Field(description="Pa; may depend on x, y, z, t")] = None
+    follower: Annotated[Flag | None, Field(description="whether it turns with the facets")] = None
+    at: Annotated[Vector | None, Field(description="m, where the point is at rest")] = None
+    force: Annotated[list[Number] | None, Field(description="N; may depend on x, y, z, t")] = None
+
+    @property
+    def kinds(self) -> list[str]:
+        """Which loads are given; a valid table names one."""
+        return [kind for kind in ("traction", "pressure", "force") if getattr(self, kind) is not None]
+
+    @property
+    def follows(self) -> bool:
+        """Whether it turns with the facets; unless told otherwise a pressure does and a traction does not."""
+        return self.pressure is not None if self.follower is None else self.follower
 
 
 class SolidInitial(Table):
@@ -262,6 +315,10 @@ class Solid(Table):
     interior: Literal["fluid", "void"] = "fluid"
     damping: Damping = Damping()
     supports: list[Support] = []
+    body_force: Annotated[
+        list[Number] | None, Field(description="N/m^3 of reference volume; may depend on x, y, z, t")
+    ] = None
+    loads: list[Load] = []
     initial: SolidInitial = SolidInitial()
 
 
@@ -288,7 +345,7 @@ class Probe(Table):
 
     of: Annotated[str, Field(description="a solid's name, or fluid")]
     at: Annotated[Vector, Field(description="m; in a solid, where the point is at rest")]
-    quantity: Literal["displacement", "velocity", "pressure", "smoke"]
+    quantity: Literal["displacement", "velocity", "angle", "pressure", "smoke"]
 
 
 class Output(Table):

@@ -15,6 +15,9 @@ MAX_CELLS = 2**31 - 1
 #: Bodies may touch the grid's sides and each other; this fraction of a length is round-off.
 SLACK = 1e-9
 
+OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
+NO_Z = "bounds z, which dim = 2 does not have"
+
 Problems = Iterator[Problem]
 
 
@@ -45,7 +48,7 @@ def _shape(key: str, shape: Shape, dim: int) -> Problems:
     kinds = shape.kinds
     if len(kinds) != 1:
         found = ", ".join(kinds) or ABSENT
-        yield Problem(key, found, "must have exactly one of box, ball, cylinder, halfspace, mesh")
+        yield Problem(key, found, "must have exactly one of box, ball, cylinder, halfspace, beam, mesh")
     if shape.box is not None:
         yield from sizes(f"{key}.box", shape.box, dim)
     if shape.ball is not None:
@@ -78,6 +81,8 @@ def _cylinder(key: str, shape: Shape, dim: int) -> Problems:
 def plain_shape(key: str, shape: Shape, dim: int) -> Problems:
     """Judge a shape that is never meshed."""
     yield from _shape(key, shape, dim)
+    if shape.beam is not None:
+        yield Problem(f"{key}.beam", ABSENT, "only a solid can be a beam; give a box, ball, cylinder or halfspace here")
     for kind in ("box", "ball"):
         cells = getattr(getattr(shape, kind), "cells", None)
         if cells is not None:

@@ -44,7 +44,7 @@ def locate(comm: MPI.Comm, mesh: LocalMesh, body: int, at: np.ndarray, key: str)
     body : int
     at : ndarray, shape (dim,)
     key : str
-        The body, for messages: ``"solids.layer"``.
+        What is there, for messages: ``"a probe of solids.layer"``.
 
     Raises
     ------
@@ -87,7 +87,5 @@ def _nearest(comm: MPI.Comm, mesh: LocalMesh, body: int, at: np.ndarray, key: st
     distance, _, number, size = min(answers, key=lambda answer: answer[:2])
     if distance > size:
         where = ", ".join(f"{x:g}" for x in at)
-        raise InputError(
-            f"a probe of {key} at [{where}] lies {distance:g} m outside it, more than an element ({size:g} m)"
-        )
+        raise InputError(f"{key} at [{where}] lies {distance:g} m outside it, more than an element ({size:g} m)")
     return Place(np.array([number]), np.ones(1))

@@ -12,6 +12,7 @@ from petfsi.errors import InputError
 from petfsi.fields.base import Slab
 from petfsi.fields.solid.elements import Bodies, Elements
 from petfsi.fields.solid.field import NodalSolid
+from petfsi.fields.solid.loads import Body, Loads
 from petfsi.fields.solid.materials import MATERIALS, Material, lame_parameters, projected
 from petfsi.fields.solid.partition import slab
 from petfsi.fields.solid.patches import grid_patches, grouped_mesh, grown_patches
@@ -45,6 +46,21 @@ class SimplexSolid(NodalSolid):
 
     def _make_elements(self, solids: Mapping[str, Solid]) -> Elements:
         return Elements(self._mesh, _bodies(solids))
+
+    def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Loads | None:
+        if not any(solid.loads or solid.body_force for solid in solids.values()):
+            return None
+        bodies, places = {}, {}
+        for index, (name, solid) in enumerate(solids.items()):
+            nodes = np.flatnonzero(self._node_body == index)
+            elements = np.searchsorted(nodes, mesh.cells[mesh.body == index])
+            local = self._mesh.cells[self._mesh.body == index]
+            bodies[name] = Body(nodes, mesh.points[nodes], elements, local, self._tags[name])
+            for n, load in enumerate(solid.loads):
+                if load.at is not None:
+                    at, key = np.array(load.at), f"solids.{name}.loads.{n}: the force"
+                    places[name, n] = locate(self.comm, self._mesh, index, at, key)
+        return Loads(self.comm, solids, bodies, self._mesh, None if self.explicit else self._pattern, places)
 
     def _make_surface(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Surface:
         number, node_body = self._number, self._node_body
@@ -149,7 +165,7 @@ class SimplexSolid(NodalSolid):
         key = body, tuple(at)
         if key not in self._places:
             index, x = self.names.index(body), np.asarray(at, dtype=float)
-            self._places[key] = locate(self.comm, self._mesh, index, x, f"solids.{body}")
+            self._places[key] = locate(self.comm, self._mesh, index, x, f"a probe of solids.{body}")
         return self._places[key].value(self.comm, self._mesh, getattr(self, quantity))
 
     def output(self) -> dict[str, Slab]:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from petfsi.fields.solid.pattern import Pattern
-from petfsi.geometry.bodies import supported
+from petfsi.geometry.places import Tags, located
+from petfsi.integrators import Integrator, Motion, Stage
 from petfsi.petsc import Layout
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Solid
+
+#: Fraction of the first step over which the initial velocity of a prescribed displacement is measured.
+INSTANT = 1e-3
 
 
 class Supports:
@@ -30,51 +37,126 @@ class Supports:
         Global number of each node.
     components : tuple of str
         What a node's unknowns are called in the scene: x, y, ...
+    tags : mapping of str to Tags
+        Of the bodies whose mesh files have some that the scene names.
 
     Attributes
     ----------
     unknowns : ndarray of int
         Global numbers, ascending.
+    placed : ndarray of int
+        Which of ``unknowns`` have a prescribed displacement; the others have a velocity.
     """
 
     def __init__(
         self, solids: Mapping[str, Solid], points: np.ndarray, node_body: np.ndarray, number: np.ndarray,
-        components: tuple[str, ...],
-    ):  # fmt: skip
+        components: tuple[str, ...], tags: Mapping[str, Tags],
+    ) -> None:  # fmt: skip
         width = len(components)
         rule = np.full((len(points), width), -1, dtype=np.int32)
-        speeds: list[Expression] = []
+        rules: list[tuple[str, Expression]] = []
         for body, (name, solid) in enumerate(solids.items()):
             nodes = np.flatnonzero(node_body == body)
             for n, support in enumerate(solid.supports):
                 key = f"solids.{name}.supports.{n}"
-                held = nodes[supported(support, points[nodes], key)]
+                held = nodes[located(support.where, points[nodes], key, tags.get(name, {}))]
                 for letter in dict.fromkeys(support.fix):
-                    rule[held, components.index(letter)] = len(speeds)
-                    speeds.append(Expression(support.velocity.get(letter, 0.0), key=f"{key}.velocity.{letter}"))
+                    rule[held, components.index(letter)] = len(rules)
+                    quantity = "displacement" if letter in support.displacement else "velocity"
+                    source = getattr(support, quantity).get(letter, 0.0)
+                    rules.append((quantity, Expression(source, key=f"{key}.{quantity}.{letter}")))
         node, direction = np.nonzero(rule >= 0)
         unknowns = width * number[node].astype(np.int64) + direction
         order = np.argsort(unknowns)
         self.unknowns = unknowns[order]
-        chosen, where = rule[node, direction][order], points[node[order]]
+        self._assign(rules, rule[node, direction][order], points[node[order]])
+
+    def _assign(self, rules: list[tuple[str, Expression]], chosen: np.ndarray, where: np.ndarray) -> None:
+        """Note which expression gives which of the unknowns, and at what position."""
         self._values = np.zeros(len(chosen))
-        self._moving = []
-        for index, speed in enumerate(speeds):
+        self._moving, self._placing = [], []
+        for index, (quantity, expression) in enumerate(rules):
             entries = np.flatnonzero(chosen == index)
-            if len(entries) and not (speed.is_constant and float(speed()) == 0.0):
-                coordinates = dict(zip("xyz", where[entries].T, strict=False))
-                self._moving.append((speed, entries, {"z": 0.0, **coordinates}))
+            part = expression, entries, {"z": 0.0, **dict(zip("xyz", where[entries].T, strict=False))}
+            if len(entries) and quantity == "displacement":
+                self._placing.append(part)
+            elif len(entries) and not (expression.is_constant and float(expression()) == 0.0):
+                self._moving.append(part)
+        self.placed = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *(part[1] for part in self._placing)]))
 
     @property
     def move(self) -> bool:
-        """Whether any of them has a velocity other than zero."""
-        return bool(self._moving)
+        """Whether any of them moves."""
+        return bool(self._moving) or any(expression.depends_on_time for expression, _, _ in self._placing)
 
     def velocities(self, time: float) -> np.ndarray:
-        """Return the prescribed velocity of each of ``unknowns``, m/s."""
+        """Return the prescribed velocity of each of ``unknowns``, m/s; anything at those that are ``placed``."""
         for speed, entries, coordinates in self._moving:
             self._values[entries] = speed(t=time, **coordinates)
         return self._values
+
+    def displacements(self, time: float) -> np.ndarray:
+        """Return the prescribed displacement of each of ``unknowns[placed]``, m."""
+        values = np.zeros(len(self.unknowns))
+        for way, entries, coordinates in self._placing:
+            values[entries] = way(t=time, **coordinates)
+        return values[self.placed]
+
+    def initial_velocities(self, dt: float) -> np.ndarray:
+        """Return the velocity of each of ``unknowns`` at time zero, m/s.
+
+        Of prescribed displacements by one-sided differences of second order over a small part of the first step.
+        """
+        values = self.velocities(0.0).copy()
+        if len(self.placed):
+            tick = INSTANT * dt
+            d = [self.displacements(n * tick) for n in range(3)]
+            values[self.placed] = (4 * d[1] - 3 * d[0] - d[2]) / (2 * tick)
+        return values
+
+    def reaching(
+        self,
+        comm: MPI.Comm,
+        layout: Layout,
+        integrator: Integrator,
+        motion: Motion,
+        stage: Stage,
+        time: float,
+        h: float,
+    ) -> np.ndarray:
+        """Return the w of ``unknowns[placed]`` that takes them to where they should be at the step's end. Collective.
+
+        Whatever the scheme, d^{n+1} is linear in w.
+
+        Parameters
+        ----------
+        comm : MPI.Comm
+        layout : Layout
+            Of the unknowns.
+        integrator : Integrator
+        motion : Motion
+            Of this rank's nodes.
+        stage : Stage
+            Of the step.
+        time, h : float
+            When it begins, and its length, s.
+        """
+        width = motion.displacement.shape[1]
+        unknowns = self.unknowns[self.placed]
+        mine = np.flatnonzero((unknowns >= layout.start) & (unknowns < layout.end))
+        rows, components = np.divmod(unknowns[mine] - layout.start, width)
+        past = tuple(values[rows] for values in motion.past)
+        there = Motion(motion.displacement[rows], motion.velocity[rows], past, motion.past_dt)
+        arrays = {f.name: getattr(stage, f.name) for f in fields(stage)}
+        parts: dict[str, Any] = {name: a[rows] for name, a in arrays.items() if isinstance(a, np.ndarray)}
+        staged = replace(stage, **parts)
+        ends = [integrator.finish(there, staged, np.full((len(rows), width), w), h).displacement for w in (0.0, 1.0)]
+        ends = [end[np.arange(len(rows)), components] for end in ends]
+        share = np.zeros(len(unknowns))
+        share[mine] = (self.displacements(time + h)[mine] - ends[0]) / (ends[1] - ends[0])
+        result = np.empty_like(share)
+        comm.Allreduce(share, result)
+        return result
 
 
 class Elimination:

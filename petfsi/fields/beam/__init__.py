@@ -1,0 +1,1 @@
+"""Beams in the plane: geometrically exact Timoshenko and Hermite Euler-Bernoulli."""

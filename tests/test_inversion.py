@@ -1,0 +1,100 @@
+"""Blocks of stable neo-Hookean material that are turned inside out come back, and energy only falls."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from solid_cases import DENSITY, LAME, MU, body, step
+
+from petfsi.bench.case import only_options
+from petfsi.errors import SolveError
+from petfsi.fields.solid import SimplexSolid
+from petfsi.scene.schema import Scene
+from petfsi.simulation import Simulation
+
+#: Speed of pressure waves, m/s: strains are those of a block of 1 m thrown at a multiple of it.
+SOUND = np.sqrt((LAME + 2 * MU) / DENSITY)
+THROWN = {
+    "stretched": [f"{10 * SOUND}*(x - 0.5)", "0.0"],
+    "squeezed": [f"{-10 * SOUND}*(x - 0.5)", "0.0"],
+}
+#: The right third lies folded back over the middle one.
+FOLDED = ["-(x - 2/3) - abs(x - 2/3)", "0.0"]
+
+
+def scene(integrator, tangent="projected", stiffness_damping=0.02, material="stable-neohookean", **initial):
+    """Return a block of 1 m, steps in which waves cross a tenth of it."""
+    block = body(
+        2, cells=(6, 6), size=(1.0, 1.0), material=material, tangent=tangent,
+        damping={"stiffness": stiffness_damping / SOUND}, initial=initial,
+    )  # fmt: skip
+    time = {"end": 12 / SOUND, "dt": 0.1 / SOUND, "integrator": integrator}
+    return Scene.model_validate({"dim": 2, "time": time, "solids": {"block": block}})
+
+
+def block(*args, **kwargs):
+    return SimplexSolid(MPI.COMM_SELF, scene(*args, **kwargs))
+
+
+def history(solid, steps, dt=0.1 / SOUND):
+    """Return energy and smallest det F at the start and after every step; waves cross the block in ten steps."""
+    energy, quality = [sum(solid.energies().values())], [solid.quality()]
+    for n in range(steps):
+        step(solid, n * dt, dt)
+        energy.append(sum(solid.energies().values()))
+        quality.append(solid.quality())
+    return np.array(energy), np.array(quality)
+
+
+def inverted(solid):
+    """Return the part of the triangles that lie on their other side."""
+    now = {name: slab.data for name, slab in solid.output().items()}
+    corners = (now["points"] + now["displacement"])[now["cells"]]
+    return np.mean(np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0)
+
+
+def recovers(energy, quality):
+    """Check that elements were inverted, none is at the end, and energy never exceeded that at the start."""
+    assert np.all(np.isfinite(energy)) and energy.max() <= energy[0] * (1 + 1e-12)
+    assert energy[-1] < 0.1 * energy[0]
+    assert quality.min() < -0.9
+    assert np.all(quality[-10:] > 0), quality[-10:]
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+@pytest.mark.parametrize("throw", THROWN)
+def test_a_block_thrown_at_ten_times_its_speed_of_sound_recovers(throw, integrator):
+    recovers(*history(block(integrator, velocity=THROWN[throw]), 120))
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+def test_a_mesh_with_a_third_of_its_elements_inverted_recovers(integrator):
+    solid = block(integrator, displacement=FOLDED)
+    assert inverted(solid) == pytest.approx(1 / 3)
+    recovers(*history(solid, 60))
+
+
+def test_a_scrambled_mesh_recovers():
+    """Every node starts somewhere else: here any element may be inverted, in any direction."""
+    solid = block("bdf2")
+    solid.displacement = np.random.default_rng(1).uniform(-0.2, 0.2, solid.displacement.shape)
+    assert inverted(solid) > 1 / 4
+    recovers(*history(solid, 60))
+
+
+def test_without_damping_of_its_own_bdf2_recovers():
+    recovers(*history(block("bdf2", stiffness_damping=0.0, velocity=THROWN["stretched"]), 300))
+
+
+def test_exact_tangents_are_what_does_not():
+    """The step's matrix is no longer positive then, and a step goes anywhere."""
+    energy, _ = history(block("bdf2", "exact", 0.0, velocity=THROWN["stretched"]), 60)
+    assert energy.max() > 10 * energy[0]
+
+
+@pytest.mark.parallel([1, 2])
+def test_an_inverted_neohookean_element_is_an_error_on_all_ranks():
+    with only_options(["-options_file", "monolithic.opts"]):
+        sim = Simulation(MPI.COMM_WORLD, scene("bdf2", material="neohookean", tangent="exact", displacement=FOLDED))
+        with pytest.raises(SolveError, match="nan"):
+            sim.prepare()
+            sim.advance()

@@ -1,0 +1,490 @@
+"""Loads on solids: resultants, what turns and what does not, tangents, tags, and an inflated cylinder."""
+
+from math import factorial
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from solid_cases import body, field, gathered, pattern_of, step, wave
+
+from petfsi.errors import InputError
+from petfsi.fields.solid import SimplexSolid
+from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.loads import Body, Loads
+from petfsi.fields.solid.loads.rules import EDGES, shape_functions, simplex_rule, with_middles
+from petfsi.fields.solid.partition import LocalMesh
+from petfsi.geometry.meshes import box_mesh
+from petfsi.geometry.surfaces import boundary_facets
+from petfsi.integrators import Stage
+from petfsi.petsc import Layout
+from petfsi.scene.load import scene_from_dict
+from petfsi.scene.schema import Box, Solid
+
+COMM = MPI.COMM_WORLD
+SIZE = np.array([1.5, 1.0, 0.8])
+
+
+@pytest.fixture(params=[2, 3], ids=["2d", "3d"])
+def dim(request):
+    return request.param
+
+
+def loaded(dim, comm=COMM, **more):
+    return field(dim, comm, b=body(dim, **more))
+
+
+def forces(solid, time=0.0, move=None, shift=None, k=0.0, values=None):
+    """Return this rank's rows of the loads' forces where nodes have moved by ``move``, a function of positions."""
+    x = solid._mesh.points
+    zero = np.zeros_like(x)
+    d = zero if move is None else move(x)
+    b = np.zeros_like(solid.reference)
+    solid._loads.assemble(time, State(d, zero, zero if shift is None else shift(x)), k, values, b)
+    return b
+
+
+def resultant(solid, **how):
+    """Return the sum of all nodal forces and of their moments about the origin, at rest."""
+    f, x = forces(solid, **how), solid.reference
+    moments = [x[:, a] @ f[:, b] - x[:, b] @ f[:, a] for a, b in ((0, 1), (1, 2), (2, 0))[: 1 if solid.dim == 2 else 3]]
+    return COMM.allreduce(np.concatenate((f.sum(axis=0), moments)))
+
+
+# ---- rules --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("simplex", [1, 2, 3])
+def test_a_rule_is_exact_to_its_degree(simplex):
+    x, w = simplex_rule(simplex, 3)
+    for powers in np.ndindex(*(6,) * simplex):
+        if sum(powers) <= 5:
+            exact = np.prod([factorial(p) for p in powers]) / factorial(sum(powers) + simplex)
+            assert w @ np.prod(x[:, 1:] ** powers, axis=1) == pytest.approx(exact, rel=1e-13)
+
+
+@pytest.mark.parametrize("simplex", [1, 2, 3])
+def test_quadratic_shape_functions_are_one_at_their_node_and_reproduce_squares(simplex):
+    corners = np.eye(simplex + 1)
+    nodes = np.concatenate((corners, corners[EDGES[simplex]].mean(axis=1)))
+    values, slopes = shape_functions(nodes, len(nodes))
+    np.testing.assert_allclose(values, np.eye(len(nodes)), atol=1e-15)
+    x, _ = simplex_rule(simplex, 2)
+    values, slopes = shape_functions(x, len(nodes))
+    np.testing.assert_allclose(values @ nodes[:, 1] ** 2, x[:, 1] ** 2, atol=1e-14)
+    np.testing.assert_allclose(np.einsum("qak,a->qk", slopes, nodes[:, 1] ** 2)[:, 0], 2 * x[:, 1], atol=1e-14)
+
+
+# ---- resultants ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_a_traction_gives_its_resultant_and_its_moment(dim):
+    load = {"where": "right", "traction": [2.0, "y - 3*y*y", "x"][:dim]}
+    lx, ly, lz = 1.5, 1.0, (1.0 if dim == 2 else 0.8)
+    f = np.array([2 * ly, ly**2 / 2 - ly**3, lx * ly][:dim]) * lz
+    got = resultant(loaded(dim, loads=[load]))
+    np.testing.assert_allclose(got[:dim], f, rtol=1e-12)
+    np.testing.assert_allclose(got[dim], lx * f[1] - 2 * ly**2 / 2 * lz, rtol=1e-12)
+
+
+@pytest.mark.parallel([1, 3])
+@pytest.mark.parametrize("follower", [True, False])
+def test_a_pressure_pushes_inward(dim, follower):
+    load = {"where": "top", "pressure": "3*x", "follower": follower}
+    lz = 1.0 if dim == 2 else 0.8
+    got = resultant(loaded(dim, loads=[load]))
+    wanted = np.array([0, -3 * 1.5**2 / 2, 0][:dim]) * lz
+    np.testing.assert_allclose(got[:dim], wanted, atol=1e-13)
+    np.testing.assert_allclose(got[dim], -(1.5**3) * lz, rtol=1e-12)
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_a_body_force_fills_the_volume(dim):
+    volume = np.prod(SIZE[:dim])
+    got = resultant(loaded(dim, body_force=["x*y", 5.0, "t*y"][:dim]), time=2.0)
+    wanted = np.array([1.5 / 2 / 2, 5.0, 2 * 0.5][:dim]) * volume
+    np.testing.assert_allclose(got[:dim], wanted, rtol=1e-12)
+    np.testing.assert_allclose(got[dim], (5 * 0.75 - 1.5 / 2 / 3) * volume, rtol=1e-12)
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("at", [(0.61, 0.37, 0.22), (1.5, 1.0, 0.8)])
+def test_a_point_force_acts_at_its_point(dim, at):
+    solid = loaded(dim, loads=[{"at": list(at[:dim]), "force": ["1 + t*x", -2.0, 3.0][:dim]}])
+    got = resultant(solid, time=2.0)
+    f = np.array([1 + 2 * at[0], -2.0, 3.0])
+    np.testing.assert_allclose(got[:dim], f[:dim], rtol=1e-12)
+    np.testing.assert_allclose(got[dim], at[0] * f[1] - at[1] * f[0], rtol=1e-12)
+
+
+@pytest.mark.parallel([1, 2])
+def test_loads_follow_time_and_what_does_not_is_integrated_once(dim):
+    static = {"where": "right", "traction": ["y", 1.0, 0.0][:dim]}
+    timed = {"where": "left", "traction": ["sin(t)", 0.0, "t*y"][:dim]}
+    alone, both = loaded(dim, loads=[static]), loaded(dim, loads=[static, timed])
+    lz = 1.0 if dim == 2 else 0.8
+    for time in (0.3, 1.7):
+        extra = np.array([np.sin(time), 0.0, time / 2][:dim]) * lz
+        difference = resultant(both, time=time)[:dim] - resultant(alone, time=time)[:dim]
+        np.testing.assert_allclose(difference, extra, atol=1e-13)
+    assert alone._loads._dead.forces(0.3) is alone._loads._dead.forces(1.7)
+
+
+def test_a_scene_without_loads_has_none(dim):
+    assert loaded(dim, MPI.COMM_SELF)._loads is None
+
+
+# ---- what turns ---------------------------------------------------------------------------------------------
+
+
+def turn(dim):
+    """Return a large rotation."""
+    q, _ = np.linalg.qr(np.random.default_rng(4).standard_normal((dim, dim)))
+    return q if np.linalg.det(q) > 0 else q[:, ::-1]
+
+
+@pytest.mark.parallel([1, 3])
+@pytest.mark.parametrize(
+    "load", [{"pressure": "1 + x*y"}, {"traction": ["1 + x", 2.0, "y"]}], ids=lambda a: next(iter(a))
+)
+def test_a_follower_turns_with_the_body_and_a_dead_load_does_not(dim, load):
+    load = {name: value[:dim] if isinstance(value, list) else value for name, value in load.items()}
+    Q = turn(dim)
+
+    def move(x):
+        return x @ Q.T + 3.0 - x
+
+    for follower in (True, False):
+        solid = loaded(dim, loads=[{"where": "all", "follower": follower, **load}])
+        rest, turned = forces(solid), forces(solid, move=move)
+        assert np.abs(rest).max(initial=0) > 0.01 or not len(rest)
+        np.testing.assert_allclose(turned, rest @ Q.T if follower else rest, atol=1e-13)
+
+
+def test_a_follower_traction_is_per_area_at_rest_and_turns_by_the_polar_rotation(dim):
+    """A stretch leaves it as it is; a stretch before a rotation does not change how far it turns."""
+    solid = loaded(dim, MPI.COMM_SELF, loads=[{"where": "right", "follower": True, "traction": [1.0, 2.0, 3.0][:dim]}])
+    Q, stretch = turn(dim), np.diag([1.0, 1.7, 0.6][:dim])
+    rest = forces(solid)
+    np.testing.assert_allclose(forces(solid, move=lambda x: x @ stretch - x), rest, atol=1e-13)
+    np.testing.assert_allclose(forces(solid, move=lambda x: x @ stretch @ Q.T - x), rest @ Q.T, atol=1e-13)
+
+
+def enclosed_volume(x, facets):
+    corners = x[facets]
+    return np.linalg.det(corners).sum() / factorial(x.shape[1])
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_uniform_pressure_on_a_closed_surface_has_no_resultant(dim):
+    solid = loaded(dim, loads=[{"where": "all", "pressure": 7.0}])
+
+    def move(x):
+        return 0.1 * np.sin(3 * x + x[:, ::-1])
+
+    f, x = forces(solid, move=move), solid.reference + move(solid.reference)
+    assert COMM.allreduce(np.abs(f).sum()) > 1
+    np.testing.assert_allclose(COMM.allreduce(f.sum(axis=0)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(COMM.allreduce(x.T @ f - f.T @ x), 0.0, atol=1e-12)
+
+
+def test_a_uniform_pressure_works_on_the_volume(dim):
+    solid = loaded(dim, MPI.COMM_SELF, loads=[{"where": "all", "pressure": 7.0}])
+    points, facets = solid._mesh.points, boundary_facets(solid._mesh.points, solid._mesh.cells)
+    d, v, e = wave(len(points), dim), wave(len(points), dim, seed=8, size=1.0), 1e-5
+    change = enclosed_volume(points + d + e * v, facets) - enclosed_volume(points + d - e * v, facets)
+    power = np.vdot(forces(solid, move=lambda x: d), v)
+    assert power == pytest.approx(-7.0 * change / (2 * e), rel=1e-8)
+
+
+# ---- tangents -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parallel([1, 2])
+def test_the_tangent_of_a_pressure_on_a_closed_surface_is_that_of_its_forces(dim):
+    solid = loaded(dim, loads=[{"where": "all", "pressure": 7.0}])
+
+    def move(x):
+        return 0.1 * np.sin(3 * x + x[:, ::-1])
+
+    def way(x):
+        return np.cos(2 * x - x[:, ::-1])
+
+    e = 1e-5
+    slope = (
+        (forces(solid, move=lambda x: move(x) + e * way(x)) - forces(solid, move=lambda x: move(x) - e * way(x)))
+        / e
+        / 2
+    )
+    values = np.zeros(len(solid._pattern.indices))
+    shifted = forces(solid, move=move, shift=way, k=0.5, values=values)
+    np.testing.assert_allclose(solid._loads.felt(way(solid._mesh.points)) - shifted, 0.5 * slope, atol=1e-8)
+    np.testing.assert_allclose(shifted - forces(solid, move=move), slope, atol=1e-8)
+    everything = np.concatenate(COMM.allgather(way(solid.reference))).ravel()
+    rows = np.repeat(np.arange(solid.layout.n_local), np.diff(solid._pattern.indptr))
+    product = np.bincount(rows, weights=values * everything[solid._pattern.indices], minlength=solid.layout.n_local)
+    np.testing.assert_allclose(product.reshape(-1, dim), -0.5 * slope, atol=1e-8)
+
+
+def test_the_pressure_leaves_the_matrix_symmetric(dim):
+    """Also where the surface is open and the pressure uneven."""
+    solid = loaded(dim, MPI.COMM_SELF, loads=[{"where": "top", "pressure": "3 + x"}])
+    values = np.zeros(len(solid._pattern.indices))
+    forces(solid, move=lambda x: 0.1 * np.sin(3 * x), k=1.0, values=values)
+    A = np.zeros((solid.layout.n_global,) * 2)
+    A[np.repeat(np.arange(len(A)), np.diff(solid._pattern.indptr)), solid._pattern.indices] = values
+    assert np.abs(A).max() > 0.01
+    np.testing.assert_allclose(A, A.T, atol=1e-15)
+
+
+# ---- quadratic elements -------------------------------------------------------------------------------------
+
+
+def quadratic(dim, **tables):
+    """Return loads on one body of quadratic elements, straight at rest, and its nodes and boundary facets."""
+    points, cells = box_mesh(Box(origin=[0] * dim, size=SIZE[:dim].tolist(), cells=[2] * dim))
+    ends = np.sort(cells[:, EDGES[dim]].reshape(-1, 2), axis=1)
+    edges, which = np.unique(ends, axis=0, return_inverse=True)
+    elements = np.concatenate((cells, len(points) + which.reshape(len(cells), -1)), axis=1).astype(np.int32)
+    nodes = np.concatenate((points, points[edges].mean(axis=1)))
+    n, all_nodes = len(nodes), np.arange(len(nodes))
+    mesh = LocalMesh(nodes, elements, np.zeros(len(cells), np.int32), np.arange(len(cells)), np.ones(len(cells), bool),
+                     all_nodes.astype(np.int32), all_nodes, Layout(n, 0, n))  # fmt: skip
+    solid = Solid.model_validate(body(dim, **tables))
+    pattern = pattern_of(nodes, elements)
+    loads = Loads(MPI.COMM_SELF, {"b": solid}, {"b": Body(all_nodes, nodes, elements, elements, {})}, mesh, pattern, {})
+    facets = with_middles(boundary_facets(points, cells), elements)
+    return loads, nodes, facets
+
+
+def test_facets_of_quadratic_elements_have_their_middles(dim):
+    _, nodes, facets = quadratic(dim)
+    middles = nodes[facets[:, :dim]][:, EDGES[dim - 1]].mean(axis=2)
+    np.testing.assert_allclose(nodes[facets[:, dim:]], middles, atol=1e-15)
+
+
+def test_loads_on_quadratic_elements_have_their_resultants(dim):
+    loads, x, _ = quadratic(
+        dim,
+        loads=[{"where": "right", "traction": ["y*y", 1.0, 0.0][:dim]}, {"where": "top", "pressure": "x*x"}],
+        body_force=["x*y*y", 0.0, 0.0][:dim],
+    )
+    b, zero = np.zeros_like(x), np.zeros_like(x)
+    loads.assemble(0.0, State(zero, zero, zero), 0.0, None, b)
+    lz = 1.0 if dim == 2 else 0.8
+    wanted = [1 / 3 + 1.5**2 / 2 / 3, 1.0 - 1.5**3 / 3, 0.0][:dim]
+    np.testing.assert_allclose(b.sum(axis=0), np.array(wanted) * lz, atol=1e-12)
+    moment = 1.5 - 1.5**4 / 4 - 1 / 4 - 1.5**2 / 2 / 4
+    np.testing.assert_allclose(x[:, 0] @ b[:, 1] - x[:, 1] @ b[:, 0], moment * lz, rtol=1e-12)
+
+
+def test_a_pressure_on_curved_quadratic_facets_has_no_resultant_and_its_exact_tangent(dim):
+    loads, x, _ = quadratic(dim, loads=[{"where": "all", "pressure": 7.0}])
+    zero, d, v, e = np.zeros_like(x), wave(len(x), dim), wave(len(x), dim, seed=8, size=1.0), 1e-5
+
+    def at(d, k=0.0, shift=zero):
+        b = np.zeros_like(x)
+        loads.assemble(0.0, State(d, zero, shift), k, None, b)
+        return b
+
+    f = at(d)
+    np.testing.assert_allclose(f.sum(axis=0), 0.0, atol=1e-13)
+    np.testing.assert_allclose((x + d).T @ f - f.T @ (x + d), 0.0, atol=1e-12)
+    slope = (at(d + e * v) - at(d - e * v)) / (2 * e)
+    np.testing.assert_allclose(at(d, k=1.0, shift=v) - f, slope, atol=1e-8)
+
+
+# ---- prescribed displacements -------------------------------------------------------------------------------
+
+WAY = {"x": "0.05*sin(4*t + y)", "y": "0.02*t*x"}
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+def test_a_prescribed_displacement_is_met_at_the_end_of_every_step(integrator, dim):
+    push = [{"where": "right", "fix": ["x", "y"], "displacement": WAY}, {"where": "left", "fix": ["x"]}]
+    solid = field(dim, COMM, integrator=integrator, b=body(dim, supports=push))
+    points = gathered(solid, "points")
+    right, left = np.isclose(points[:, 0], 1.5), np.isclose(points[:, 0], 0.0)
+
+    def wanted(t):
+        x, y = points[right, 0], points[right, 1]
+        return np.column_stack((0.05 * np.sin(4 * t + y), 0.02 * t * x))
+
+    def check(t):
+        d = gathered(solid, "displacement")
+        np.testing.assert_allclose(d[right, :2], wanted(t), atol=1e-15)
+        np.testing.assert_allclose(d[left, 0], 0.0, atol=1e-15)
+
+    check(0.0)
+    u = gathered(solid, "velocity")[right, :2]
+    y = points[right, 1]
+    np.testing.assert_allclose(u, np.column_stack((0.2 * np.cos(y), 0.03 + 0 * y)), atol=1e-7)
+    t = 0.0
+    for h in (0.1, 0.1, 0.07, 0.13):
+        step(solid, t, h)
+        t += h
+        check(t)
+
+
+def test_the_later_support_decides_between_velocity_and_displacement():
+    both = [
+        {"where": "all", "fix": ["x", "y"], "velocity": {"x": 1.0}},
+        {"where": "right", "fix": ["x"], "displacement": {"x": "t*t"}},
+    ]
+    solid = field(2, MPI.COMM_SELF, integrator="bdf2", b=body(2, supports=both))
+    for n in range(3):
+        step(solid, 0.1 * n, 0.1)
+    d, x = gathered(solid, "displacement"), gathered(solid, "points")
+    right = np.isclose(x[:, 0], 1.5)
+    np.testing.assert_allclose(d[right, 0], 0.09, atol=1e-15)
+    np.testing.assert_allclose(d[~right, 0], 0.3, rtol=1e-12)
+
+
+def test_an_unknown_follows_the_prescribed_displacement_at_second_order():
+    """The end of a bar whose other end is moved, with the same way prescribed as velocity: both orders are 2."""
+
+    def tip(supports, n):
+        solid = field(2, MPI.COMM_SELF, integrator="bdf2", b=body(2, (4, 1), size=(1.5, 0.3), supports=supports))
+        for k in range(n):
+            step(solid, 0.4 / n * k, 0.4 / n)
+        x = gathered(solid, "points")
+        return gathered(solid, "displacement")[np.isclose(x[:, 0], 1.5), 0].mean()
+
+    rails = {"where": "bottom", "fix": ["y"]}
+    way = [{"where": "left", "fix": ["x"], "displacement": {"x": "0.02*sin(3*t)**2"}}, rails]
+    speed = [{"where": "left", "fix": ["x"], "velocity": {"x": "0.06*sin(6*t)"}}, rails]
+    exact = tip(way, 640)
+    for supports in (way, speed):
+        error = [abs(tip(supports, n) - exact) for n in (20, 40)]
+        assert np.log2(error[0] / error[1]) == pytest.approx(2.0, abs=0.25), (supports, error)
+
+
+# ---- tags ---------------------------------------------------------------------------------------------------
+
+
+def annulus(path, n_along, n_around, quarter=True):
+    """Write a quarter of a ring, radii 1 to 1.2, with its inner arc and both cuts tagged."""
+    box = Box(origin=[0, 0], size=[1, 1], cells=[n_along, n_around])
+    s, cells = box_mesh(box)
+    radius, angle = 1 + 0.2 * s[:, 0], np.pi / 2 * s[:, 1]
+    points = np.column_stack((radius * np.cos(angle), radius * np.sin(angle)))
+    facets = boundary_facets(s, cells)
+    lines = {1: (0, 0.0), 2: (1, 0.0), 3: (1, 1.0)}
+    chosen = {tag: facets[np.isclose(s[facets][:, :, axis], end).all(axis=1)] for tag, (axis, end) in lines.items()}
+    # a point that belongs to no cell comes first: numbers shift when it is dropped
+    points = np.vstack(([[9.0, 9.0]], points))
+    blocks = [("triangle", cells + 1), *(("line", some + 1) for some in chosen.values())]
+    physical = [np.full(len(cells), 7), *(np.full(len(some), tag) for tag, some in chosen.items())]
+    mesh = meshio.Mesh(
+        np.column_stack((points, np.zeros(len(points)))), blocks,
+        cell_data={"gmsh:physical": physical, "gmsh:geometrical": physical},
+        field_data={"inner": np.array([1, 1]), "floor": np.array([2, 1]), "body": np.array([7, 2])},
+    )  # fmt: skip
+    if COMM.rank == 0:
+        mesh.write(path, file_format="gmsh22", binary=False)
+    COMM.barrier()
+
+
+def ring(path, lame=1.5, **more):
+    young, poisson = (3 * lame + 2) / (lame + 1), lame / (2 * (lame + 1))
+    supports = [{"where": {"tag": "floor"}, "fix": ["y"]}, {"where": {"tag": "3"}, "fix": ["x"]}]
+    solid = {"shape": {"mesh": str(path)}, "density": 1.0, "young": young, "poisson": poisson, "supports": supports}
+    return {"dim": 2, "time": {"end": 1.0, "dt": 0.1}, "solids": {"ring": solid | more}}
+
+
+@pytest.fixture
+def shared_path(tmp_path):
+    return COMM.bcast(tmp_path)
+
+
+@pytest.mark.parallel([1, 3])
+def test_tags_of_a_mesh_file_pick_facets_and_nodes(shared_path):
+    annulus(shared_path / "ring.msh", 2, 8)
+    load = {"where": {"tag": "inner"}, "pressure": 2.0}
+    solid = SimplexSolid(COMM, scene_from_dict(ring(shared_path / "ring.msh", loads=[load])))
+    np.testing.assert_allclose(resultant(solid)[:2], [2.0, 2.0], rtol=1e-12)
+    assert len(solid._supports.unknowns) == 6
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("where", ["loads", "supports"])
+def test_an_unknown_tag_is_named_with_those_that_the_file_has(shared_path, where):
+    annulus(shared_path / "ring.msh", 1, 4)
+    item = {"loads": {"pressure": 1.0}, "supports": {"fix": ["x"]}}[where] | {"where": {"tag": "iner"}}
+    data = ring(shared_path / "ring.msh", **{where: [item]})
+    with pytest.raises(InputError, match=rf"solids.ring.{where}.0.where.tag = 'iner'.*it has 3, floor, inner$"):
+        SimplexSolid(COMM, scene_from_dict(data))
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_load_that_finds_no_facet_and_a_force_outside_are_refused(dim):
+    ball = {"ball": {"centre": SIZE[:dim].tolist(), "radius": 0.01}}
+    with pytest.raises(
+        InputError, match=r"solids.b.loads.0.where: none of the \d+ boundary facets .* lies there whole"
+    ):
+        loaded(dim, loads=[{"where": ball, "pressure": 1.0}])
+    with pytest.raises(InputError, match=r"solids.b.loads.0: the force at \[9, 9.* outside it"):
+        loaded(dim, loads=[{"at": [9.0] * dim, "force": [1.0] * dim}])
+
+
+@pytest.mark.parallel([1, 2])
+def test_an_expression_that_blows_up_is_named_on_every_rank(dim):
+    solid = loaded(dim, loads=[{"where": "left", "pressure": "sqrt(y - t)"}])
+    forces(solid, time=0.0)
+    with pytest.raises(InputError, match="solids.b.loads.0.pressure"):
+        forces(solid, time=0.5)
+    with pytest.raises(InputError, match="solids.b.loads.0.traction.1"):
+        loaded(dim, loads=[{"where": "left", "traction": [0.0, "log(y - 0.5)", 0.0][:dim]}])
+
+
+# ---- statics ------------------------------------------------------------------------------------------------
+
+
+def newton(solid, most=25, tolerance=1e-12):
+    """Bring a solid into equilibrium; return the norms of the residuals on the way."""
+    norms = []
+    ksp = PETSc.KSP().create(solid.comm)
+    ksp.setType("preonly")
+    ksp.getPC().setType("lu")
+    ksp.getPC().setFactorSolverType("mumps")
+    x, b = solid.block.createVecs()
+    while len(norms) < most and (not norms or norms[-1] > tolerance):
+        zero = np.zeros_like(solid.displacement)
+        solid._stage = Stage(a=0.0, k=1.0, inertia=zero, tangent_at=solid.displacement, shift=zero)
+        solid.assemble(0.0, 1.0)
+        b.setArray(solid.rhs)
+        norms.append(b.norm())
+        ksp.setOperators(solid.block)
+        ksp.solve(b, x)
+        solid.displacement = solid.displacement + x.getArray().reshape(-1, solid.dim)
+    for thing in (ksp, x, b):
+        thing.destroy()
+    return norms
+
+
+def inflate(path, n, pressure):
+    """Return the stretch of the inner radius and the residuals of the last load step's Newton iterations."""
+    annulus(path, n, 8 * n)
+    load = {"where": {"tag": "inner"}, "pressure": pressure}
+    solid = SimplexSolid(COMM, scene_from_dict(ring(path, material="neohookean", loads=[load])))
+    norms = newton(solid)
+    X, d = gathered(solid, "points"), gathered(solid, "displacement")
+    inner = np.isclose(np.linalg.norm(X, axis=1), 1.0)
+    return np.linalg.norm(X + d, axis=1)[inner].mean(), norms
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_thick_cylinder_inflates_as_derived_and_newton_converges_quadratically(shared_path):
+    table = np.genfromtxt("tests/data/cylinder_inflation_planestrain.csv", delimiter=",", comments="#", skip_header=4)
+    for _, stretch, pressure, _ in table[:4]:
+        found = [inflate(shared_path / f"{n}.msh", n, pressure) for n in (2, 4)]
+        errors = [abs(a - stretch) for a, _ in found]
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.25), (stretch, errors)
+        norms = np.array(found[1][1])
+        assert norms[-1] < 1e-12, norms
+        late = norms[(norms < 1e-2) & (norms > 1e-7)]
+        assert len(norms) <= 12 and np.all(norms[np.flatnonzero(np.isin(norms, late)) + 1] < 100 * late**1.8), norms
+    assert errors[1] < 0.005 * stretch
