@@ -21,14 +21,15 @@ THROWN = {
 FOLDED = ["-(x - 2/3) - abs(x - 2/3)", "0.0"]
 
 
-def scene(integrator, tangent="projected", stiffness_damping=0.02, material="stable-neohookean", **initial):
+def scene(integrator, tangent="projected", stiffness_damping=0.02, dim=2, initial=None, **more):
     """Return a block of 1 m, steps in which waves cross a tenth of it."""
+    initial = {name: [*given, "0.0"][:dim] for name, given in (initial or {}).items()}
     block = body(
-        2, cells=(6, 6), size=(1.0, 1.0), material=material, tangent=tangent,
-        damping={"stiffness": stiffness_damping / SOUND}, initial=initial,
+        dim, cells=(6, 6) if dim == 2 else (4, 4, 4), size=(1.0, 1.0, 1.0), tangent=tangent, initial=initial,
+        damping={"stiffness": stiffness_damping / SOUND}, **{"material": "stable-neohookean"} | more,
     )  # fmt: skip
     time = {"end": 12 / SOUND, "dt": 0.1 / SOUND, "integrator": integrator}
-    return Scene.model_validate({"dim": 2, "time": time, "solids": {"block": block}})
+    return Scene.model_validate({"dim": dim, "time": time, "solids": {"block": block}})
 
 
 def block(*args, **kwargs):
@@ -63,14 +64,22 @@ def recovers(energy, quality):
 @pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
 @pytest.mark.parametrize("throw", THROWN)
 def test_a_block_thrown_at_ten_times_its_speed_of_sound_recovers(throw, integrator):
-    recovers(*history(block(integrator, velocity=THROWN[throw]), 120))
+    recovers(*history(block(integrator, initial={"velocity": THROWN[throw]}), 120))
 
 
 @pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
 def test_a_mesh_with_a_third_of_its_elements_inverted_recovers(integrator):
-    solid = block(integrator, displacement=FOLDED)
+    solid = block(integrator, initial={"displacement": FOLDED})
     assert inverted(solid) == pytest.approx(1 / 3)
     recovers(*history(solid, 60))
+
+
+@pytest.mark.parametrize("start", ["stretched", "squeezed"])
+@pytest.mark.parametrize(
+    "kind", [{"elements": "quadratic"}, {"volumetric": "reduced"}, {"dim": 3}], ids=["quadratic", "reduced", "3d"]
+)
+def test_so_do_other_elements(kind, start):
+    recovers(*history(block("bdf2", initial={"velocity": THROWN[start]}, **kind), 120))
 
 
 def test_a_scrambled_mesh_recovers():
@@ -82,19 +91,21 @@ def test_a_scrambled_mesh_recovers():
 
 
 def test_without_damping_of_its_own_bdf2_recovers():
-    recovers(*history(block("bdf2", stiffness_damping=0.0, velocity=THROWN["stretched"]), 300))
+    recovers(*history(block("bdf2", stiffness_damping=0.0, initial={"velocity": THROWN["stretched"]}), 300))
 
 
 def test_exact_tangents_are_what_does_not():
     """The step's matrix is no longer positive then, and a step goes anywhere."""
-    energy, _ = history(block("bdf2", "exact", 0.0, velocity=THROWN["stretched"]), 60)
+    energy, _ = history(block("bdf2", "exact", 0.0, initial={"velocity": THROWN["stretched"]}), 60)
     assert energy.max() > 10 * energy[0]
 
 
 @pytest.mark.parallel([1, 2])
 def test_an_inverted_neohookean_element_is_an_error_on_all_ranks():
     with only_options(["-options_file", "monolithic.opts"]):
-        sim = Simulation(MPI.COMM_WORLD, scene("bdf2", material="neohookean", tangent="exact", displacement=FOLDED))
+        sim = Simulation(
+            MPI.COMM_WORLD, scene("bdf2", material="neohookean", tangent="exact", initial={"displacement": FOLDED})
+        )
         with pytest.raises(SolveError, match="nan"):
             sim.prepare()
             sim.advance()
