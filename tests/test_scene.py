@@ -181,8 +181,12 @@ BROKEN = [
     (["solids.layer.tangent=soft"], 'tangent = "soft"', "must be 'exact' or 'projected' (projected: without"),
     (["solids.layer.interior=air"], 'interior = "air"', "must be 'fluid' or 'void'"),
     (["solids.layer.supports.0.fix=[]"], "solids.layer.supports.0.fix = []", "must not be empty"),
-    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "must be 'x', 'y', 'z' or 'angle'"),
-    (["solids.layer.supports.0.velocity={w = 1.0}"], "solids.layer.supports.0.velocity.w", "must be 'x', 'y', 'z' or 'angle'"),
+    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "'x', 'y', 'z' or 'angle'"),
+    (
+        ["solids.layer.supports.0.velocity={w = 1.0}"],
+        "solids.layer.supports.0.velocity.w",
+        "must be 'x', 'y', 'z' or 'angle'",
+    ),
     (
         ["solids.layer.supports.0.where=under"],
         'where = "under"',
@@ -332,7 +336,11 @@ BROKEN = [
         "displacement.y = 1.0",
         "a displacement belongs to fixed axes",
     ),
-    (["solids.layer.supports.0.displacement={w = 1.0}"], "supports.0.displacement.w", "must be 'x', 'y', 'z' or 'angle'"),
+    (
+        ["solids.layer.supports.0.displacement={w = 1.0}"],
+        "supports.0.displacement.w",
+        "must be 'x', 'y', 'z' or 'angle'",
+    ),
     (["solids.layer.supports.1.displacement={x = 'q'}"], 'displacement.x = "q"', "unknown name 'q'"),
     # loads
     (["solids.layer.body_force=[1.0]"], "solids.layer.body_force = [1.0]", "must have 2 items"),
@@ -371,7 +379,11 @@ BROKEN = [
     ([load("at = [0.5, 0.5], force = [1.0]")], "loads.0.force = [1.0]", "must have 2 items"),
     ([load("at = [0.5, 0.5], force = [1.0, 'x*']")], 'loads.0.force.1 = "x*"', "is not an expression"),
     ([load("where = 'front', pressure = 1.0")], 'loads.0.where = "front"', "bounds z, which dim = 2 does not have"),
-    ([load("where = 'under', pressure = 1.0")], 'loads.0.where = "under"', "'front', 'all', 'start' or 'end' (or a shape such as"),
+    (
+        [load("where = 'under', pressure = 1.0")],
+        'loads.0.where = "under"',
+        "'all', 'start' or 'end' (or a shape such as",
+    ),
     ([load("where = { tag = 'lid' }, pressure = 1.0")], 'loads.0.where.tag = "lid"', "a tag is a mesh file's"),
     ([load("where = { mesh = 'a.stl' }, pressure = 1.0")], "loads.0.where.mesh", "must be a box, ball, cylinder or"),
     (
@@ -505,7 +517,7 @@ def test_a_report_fits_on_a_screen():
         scene_from_dict(data)
     lines = str(caught.value).splitlines()
     assert lines[0] == "scene: 60 mistakes" and lines[-1] == "  and 20 more" and len(lines) == 42
-    long = mistakes(layer(f"time.integrator={'x' * 500}"))[0]
+    long = mistakes(layer(f"fluid.advection={'x' * 500}"))[0]
     assert len(long) < 120
 
 
