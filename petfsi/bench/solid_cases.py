@@ -82,7 +82,7 @@ def csm(comm: MPI.Comm, folder: Path, case: str, thick: int, elements: str) -> S
 def csm3(comm: MPI.Comm, folder: Path, thick: int, elements: str, integrator: str, dt: float, end: float) -> Scene:
     """Return the bar let go from rest under gravity, explicit schemes in sub-steps. Collective."""
     solid = _bar(comm, folder, thick, elements, CSM3_YOUNG)
-    explicit = {"above_limit": "subcycle"} if integrator == "symplectic-euler" else {}
+    explicit: dict[str, Any] = {"above_limit": "subcycle"} if integrator == "symplectic-euler" else {}
     return _scene(solid, (TIP, CENTRE[1]), integrator, end, dt, **explicit)
 
 
@@ -134,7 +134,7 @@ def _bar(comm: MPI.Comm, folder: Path, thick: int, elements: str, young: float) 
 
 def _scene(
     solid: dict[str, Any], at: tuple[float, float], integrator: str, end: float, dt: float, ramp: bool = False,
-    **time: str,
+    **time: Any,
 ) -> Scene:  # fmt: skip
     heavy = "poisson" in solid and solid["density"] == DENSITY
     data = {

@@ -413,10 +413,6 @@ def _shortest_edge(mesh: SimplexMesh) -> float:
     return float(np.sqrt((edges[:, a, b] ** 2).sum(axis=-1).min()))
 
 
-def _tags(scene: Scene, solids: Mapping[str, Solid]) -> dict[str, Tags]:
-    return {name: read_tags(solid, scene.dim, f"solids.{name}", scene.directory) for name, solid in solids.items()}
-
-
 def _evaluate(
     given: dict[str, tuple[str, list[Number] | None]], points: np.ndarray, node_body: np.ndarray, width: int
 ) -> np.ndarray:
