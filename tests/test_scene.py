@@ -517,7 +517,7 @@ def test_a_report_fits_on_a_screen():
         scene_from_dict(data)
     lines = str(caught.value).splitlines()
     assert lines[0] == "scene: 60 mistakes" and lines[-1] == "  and 20 more" and len(lines) == 42
-    long = mistakes(layer(f"time.integrator={'x' * 500}"))[0]
+    long = mistakes(layer(f"fluid.advection={'x' * 500}"))[0]
     assert len(long) < 120
 
 

@@ -12,12 +12,12 @@ from scipy.sparse import csr_matrix
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.loads.dead import DeadLoads
 from petfsi.fields.solid.loads.followers import FollowerPressure, FollowerTraction
-from petfsi.fields.solid.loads.rules import with_middles
 from petfsi.fields.solid.loads.simplices import Coordinates, Simplices
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.probes import Place
 from petfsi.geometry.places import Tags, located_facets
+from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
@@ -61,8 +61,8 @@ class Loads:
     solids : mapping of str to Solid
     bodies : mapping of str to Body
     mesh : LocalMesh
-    pattern : Pattern
-        Of the block; all nodes of a facet must be neighbours in it.
+    pattern : Pattern or None
+        Of the block; all nodes of a facet must be neighbours in it. None for explicit steps, which have no tangent.
     places : mapping of (str, int) to Place
         Of every force at a point: the body and the index of the load.
 
@@ -74,7 +74,7 @@ class Loads:
 
     def __init__(
         self, comm: MPI.Comm, solids: Mapping[str, Solid], bodies: Mapping[str, Body], mesh: LocalMesh,
-        pattern: Pattern, places: Mapping[tuple[str, int], Place],
+        pattern: Pattern | None, places: Mapping[tuple[str, int], Place],
     ) -> None:  # fmt: skip
         self.comm, self._mesh = comm, mesh
         self.dim = mesh.points.shape[1]
@@ -83,7 +83,7 @@ class Loads:
         self._tractions: list[FollowerTraction] = []
         agreed(comm, lambda: self._collect(solids, bodies, places))
         self.follow = bool(self._pressures or self._tractions)
-        self._tangents = [_Tangent(pressure.facets, mesh, pattern) for pressure in self._pressures]
+        self._tangents = [_Tangent(p.facets, mesh, pattern) for p in self._pressures] if pattern is not None else []
         self._force, self._k = np.zeros((mesh.n_owned, self.dim)), 0.0
 
     # ---- set-up -----------------------------------------------------------------------------------------------
@@ -116,9 +116,8 @@ class Loads:
 
     def _add_facets(self, key: str, load: Load, body: Body, skin: np.ndarray | None) -> None:
         assert load.where is not None and skin is not None
-        facets = skin[located_facets(load.where, body.points, skin, key, body.tags)]
-        if body.elements.shape[1] > self.dim + 1:
-            facets = with_middles(facets, body.elements)
+        chosen = skin[located_facets(load.where, body.points, skin, key, body.tags)]
+        facets = facets_with_middles(chosen, body.elements)
         on = Simplices(self._mesh.points, self._local(body.nodes[facets]), self.dim, FACET_POINTS)
         if load.pressure is not None:
             pressure = Expression(load.pressure, key=f"{key}.pressure")
@@ -212,7 +211,7 @@ class _Tangent:
         self._facets, self._n, dim = facets, mesh.n_owned, facets.dim
         nodes = facets.nodes
         unknowns = dim * mesh.number[nodes].astype(np.int64)[:, :, None] + np.arange(dim)
-        unknowns = unknowns.reshape(len(nodes), -1)
+        unknowns = unknowns.reshape(len(nodes), dim * nodes.shape[1])
         row = np.repeat(unknowns - dim * mesh.nodes.start, unknowns.shape[1], axis=1).ravel()
         column = np.tile(unknowns, (1, unknowns.shape[1])).ravel()
         self._chosen = np.repeat(np.repeat(nodes < self._n, dim, axis=1), unknowns.shape[1], axis=1).ravel()
