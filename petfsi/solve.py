@@ -282,7 +282,8 @@ class Solver:
     def _iteration(self) -> Newton:
         if self._newton is None:
             # full steps nearly always do where there is inertia; in statics the residual often has to grow first
-            self._newton = Newton(self.system, self, PREFIX, "l2" if self._static else "bt")
+            defaults = self.system.fields[0].statics if self._static else {"snes_linesearch_type": "bt"}
+            self._newton = Newton(self.system, self, PREFIX, defaults)
         return self._newton
 
     def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> tuple[int, dict[str, float]]:

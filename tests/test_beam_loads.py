@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
 from solid_cases import gathered, step
+from step_cases import prepared
 from test_beams import CLAMP, beam, field
 
 from petfsi.errors import InputError
 from petfsi.fields.solid.elements import State
+from petfsi.scene.schema import Scene
 
 #: EI = 1 and EA = 1.3e6 for a length of 1.
 SLENDER = {"thickness": 0.003, "start": (0.0, 0.0), "end": (1.0, 0.0)}
@@ -159,35 +160,45 @@ def test_a_followers_tangent_is_the_symmetric_part_of_its_derivative(theory):
     np.testing.assert_allclose(K, (exact + exact.T) / 2, atol=1e-8)
 
 
+# ---- by the program -----------------------------------------------------------------------------------------
+
+
+def static(load, steps, elements):
+    """Return the tip's place and angle at the end, and the iterations of each step of load."""
+    scene = {
+        "dim": 2,
+        "time": {"end": 1.0, "dt": 1 / steps, "integrator": "static", "retries": 0},
+        "solids": {"b": cantilever([load], elements=elements)},
+        "probes": {q: {"of": "b", "at": [1.0, 0.0], "quantity": q} for q in ("displacement", "angle")},
+    }
+    with prepared(Scene.model_validate(scene)) as sim:
+        counts = []
+        for _ in range(steps):
+            sim.advance()
+            counts.append(sim.outcome.newton)
+        return sim.probe(), counts
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize(
+    "alpha, exact",
+    [(1, (0.0564332363, 0.3017207738)), (2, (0.1606417208, 0.4934574804)), (5, (0.3876283607, 0.7137915236)),
+     (10, (0.5549955978, 0.8106090249))],
+)  # fmt: skip
+def test_statics_find_the_elastica(alpha, exact):
+    (u, w, _), counts = static({"at": [1.0, 0.0], "force": [0.0, f"{alpha}*t"]}, 5, 8)
+    np.testing.assert_allclose((-u, w), exact, rtol=1e-3)
+    assert max(counts) < 20
+
+
+def test_statics_roll_a_beam_up_into_a_circle():
+    (u, w, angle), counts = static({"at": [1.0, 0.0], "moment": "2*pi*t"}, 10, 10)
+    assert np.hypot(1 + u, w) < 1e-3
+    assert angle == pytest.approx(2 * np.pi, rel=1e-8)
+    assert max(counts) < 20
+
+
 # ---- in motion ----------------------------------------------------------------------------------------------
-
-
-def newton_step(solid, time, dt):
-    """Take a midpoint step whose equation is solved to round-off: w by Newton's iteration, one rank."""
-    solid.predict(time, dt)
-    stage = solid._stage
-    w, first = -stage.shift / stage.k, None
-    for _ in range(30):
-        move = stage.k * w
-        solid._stage = type(stage)(stage.a, stage.k, stage.inertia, stage.tangent_at + stage.shift + move, -move)
-        solid.assemble(time, dt)
-        ksp = PETSc.KSP().create(solid.comm)
-        ksp.setOperators(solid.block)
-        ksp.setType("preonly")
-        ksp.getPC().setType("lu")
-        x, b = solid.block.createVecs()
-        b.setArray(solid.rhs)
-        ksp.solve(b, x)
-        change = np.abs(x.getArray() - w.ravel()).max()
-        w = x.getArray().reshape(w.shape).copy()
-        for thing in (ksp, x, b):
-            thing.destroy()
-        first = first or change
-        if change < 1e-11 * max(1.0, np.abs(w).max()):
-            break
-    else:
-        raise AssertionError(f"Newton's iteration does not converge: {change}")
-    solid.accept(w.ravel(), time, dt)
 
 
 def angular_momentum(solid):
@@ -210,21 +221,24 @@ def test_flying_spaghetti_keeps_its_momentum_and_its_energy():
     loads = [{"at": [6.0, 0.0], "force": ["8*heaviside(2.5 - t)", 0.0], "moment": "-80*heaviside(2.5 - t)"}]
     rod = beam(elements=5, start=(6.0, 0.0), end=(0.0, 8.0), thickness=thickness, loads=loads)
     rod |= {"young": 1e4 / thickness, "poisson": shear, "density": 1 / thickness}
-    solid = field(integrator="midpoint", b=rod)
-    np.testing.assert_allclose(solid._elements.sections.stiffness, [[1e4, 1e4, 500]], rtol=1e-12)
-    h, kept = 0.0125, []
-    for k in range(400):
-        newton_step(solid, k * h, h)
-        if k >= 200:
-            kept.append([angular_momentum(solid), sum(solid.energies().values())])
-        if k in (199, 399):
-            np.testing.assert_allclose(solid.stock().momentum, [20.0, 0.0], atol=1e-8)
+    time = {"end": 5.0, "dt": 0.0125, "integrator": "midpoint"}
+    scene = Scene.model_validate({"dim": 2, "time": time, "solids": {"b": rod}})
+    with prepared(scene, "-fsi_snes_type", "newtonls", comm=MPI.COMM_SELF) as sim:
+        solid, kept, bent = sim.solid, [], 0.0
+        np.testing.assert_allclose(solid._elements.sections.stiffness, [[1e4, 1e4, 500]], rtol=1e-12)
+        for k in range(400):
+            sim.advance()
+            bent = max(bent, np.ptp(gathered_nodes(solid)[:, 2]))
+            if k >= 200:
+                kept.append([angular_momentum(solid), sum(solid.energies().values())])
+            if k in (199, 399):
+                np.testing.assert_allclose(solid.stock().momentum, [20.0, 0.0], atol=1e-8)
     spin, energy = np.array(kept).T
     assert abs(spin[0]) > 100
     np.testing.assert_allclose(spin, spin[0], rtol=1e-9)
     assert np.ptp(energy) < 0.005 * energy.mean()
     assert np.abs(solid.displacement[:, 2]).max() > np.pi
-    assert np.ptp(gathered_nodes(solid)[:, 2]) > 0.3  # it is bent
+    assert bent > 1.0
 
 
 def test_loads_work_on_the_way_of_their_points(theory):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
@@ -102,6 +103,8 @@ class Field(ABC):
         How often the block was assembled.
     pattern_version : int
         Grows whenever the pattern of the block changes; the same on all ranks.
+    statics : mapping of str to str
+        PETSc options that suit Newton's method where there is no inertia, unless others are given.
     """
 
     name: str
@@ -112,6 +115,7 @@ class Field(ABC):
     col_scale: float = 1.0
     n_assembled: int = 0
     pattern_version: int = 0
+    statics: ClassVar[Mapping[str, str]] = {"snes_linesearch_type": "l2"}
 
     @abstractmethod
     def unknown(self) -> np.ndarray:
