@@ -186,7 +186,7 @@ def static(load, steps, elements):
      (10, (0.5549955978, 0.8106090249))],
 )  # fmt: skip
 def test_statics_find_the_elastica(alpha, exact):
-    (u, w, _), counts = static({"at": [1.0, 0.0], "force": [0.0, f"{alpha}*t"]}, 5, 8)
+    (u, w, _), counts = static({"at": [1.0, 0.0], "force": [0.0, f"{alpha}*t"]}, 10, 8)
     np.testing.assert_allclose((-u, w), exact, rtol=1e-3)
     assert max(counts) < 20
 
