@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -66,6 +67,11 @@ class Integrator(Protocol):
         """The names of the arrays in ``Motion.past``."""
         ...
 
+    @property
+    def explicit(self) -> bool:
+        """Whether k = 0, and the mass lumped, so that A is diagonal and a step beyond the stable one grows."""
+        ...
+
     def factor(self, h: float, past_dt: float) -> float:
         """Return 1/a, s: an acceleration acts so long on w, and the pressure's gradient on the fluid's velocity."""
         ...
@@ -108,6 +114,7 @@ class Newmark:
 
     order: ClassVar[int] = 1
     past: ClassVar[tuple[str, ...]] = ()
+    explicit: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return h."""
@@ -154,6 +161,7 @@ class Bdf2:
 
     order: ClassVar[int] = 2
     past: ClassVar[tuple[str, ...]] = ("displacement_before", "velocity_before")
+    explicit: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return c; 2h/3 for equal steps, h in the first one."""
@@ -217,6 +225,7 @@ class Midpoint:
 
     order: ClassVar[int] = 2
     past: ClassVar[tuple[str, ...]] = ("velocity_middle", "velocity_ahead")
+    explicit: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return h/2."""
@@ -266,9 +275,128 @@ class Midpoint:
         return Motion(motion.displacement + h * w, 2 * w - motion.velocity, (w, ahead), h)
 
 
+@dataclass(frozen=True)
+class SymplecticEuler:
+    """Euler's symplectic scheme with a lumped mass: explicit, A is diagonal.
+
+    With C = a0 M + a1 K', the force taken at the begin of the step and a0 implicit,
+
+        ((1/h + a0) M) u^{n+1} = M u^n / h - K(d^n) - a1 K'(d^n) u^n + f(t^n),     d^{n+1} = d^n + h u^{n+1} .
+
+    Stable for  omega h <= 2  without damping, else see ``stable_step``; there the energy stays within a bound that
+    shrinks with h, for as long as one likes. Of first order: u^n is the velocity of t^n - h/2 to second order.
+
+    References
+    ----------
+    E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), sections I.1 and VI.3.
+    """
+
+    order: ClassVar[int] = 1
+    past: ClassVar[tuple[str, ...]] = ()
+    explicit: ClassVar[bool] = True
+
+    def factor(self, h: float, past_dt: float) -> float:
+        """Return h."""
+        return h
+
+    def moment(self, h: float) -> float:
+        """Return 0: the begin of the step."""
+        return 0.0
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return the end of the step."""
+        return (h,)
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return u^n."""
+        return motion.velocity
+
+    def stage(self, motion: Motion, h: float) -> Stage:
+        """Return the equation without damping, which who knows a1 adds by ``shift`` = a1 u^n."""
+        u = motion.velocity
+        return Stage(a=1 / h, k=0.0, inertia=u / h, tangent_at=motion.displacement, shift=np.zeros_like(u))
+
+    def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
+        """Return u^{n+1} = w and d^{n+1}."""
+        return Motion(motion.displacement + h * w, w, (), h)
+
+
+def stable_step(eigenvalue: float, stiffness_damping: float) -> float:
+    """Return the longest stable step of ``SymplecticEuler``, s.
+
+    A mode of M^-1 K' = omega^2 with damping a1 K', whose explicit treatment costs some of the step, is stable while
+
+        h^2 omega^2 + 2 h a1 omega^2 <= 4,    h = sqrt(a1^2 + 4/omega^2) - a1 .
+
+    Implicit mass damping only helps.
+
+    Parameters
+    ----------
+    eigenvalue : float
+        The largest omega^2, 1/s^2; inf if nothing is pulled.
+    stiffness_damping : float
+        a1, s.
+    """
+    if not eigenvalue > 0:
+        return np.inf if eigenvalue <= 0 else 0.0
+    span = 4 / eigenvalue
+    # the difference of the two without cancellation
+    return float(span / (stiffness_damping + np.sqrt(stiffness_damping**2 + span)))
+
+
+@dataclass(frozen=True)
+class Static:
+    """Equilibrium at the end of each step: no inertia; time is the parameter of the loads.
+
+        K(d~) + K'(d~) (d^n + h w - d~) = f(t^n + h),     d^{n+1} = d^n + h w,     u = 0,
+
+    linearised about d~ = d^n unless Newton's method goes on from there. w is the rate of the equilibrium.
+    """
+
+    order: ClassVar[int] = 1
+    past: ClassVar[tuple[str, ...]] = ("rate",)
+    explicit: ClassVar[bool] = False
+
+    def factor(self, h: float, past_dt: float) -> float:
+        """Return infinity: nothing resists being accelerated."""
+        return np.inf
+
+    def moment(self, h: float) -> float:
+        """Return h: the end of the step."""
+        return h
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return both ends: the mean brings a prescribed node to within the trapezoidal rule of its place."""
+        return (0.0, h)
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return the rate of the last step."""
+        return motion.past[0] if motion.past_dt else np.zeros_like(motion.velocity)
+
+    def stage(self, motion: Motion, h: float) -> Stage:
+        """Return the equilibrium at the end of the step."""
+        d = motion.displacement
+        return Stage(a=0.0, k=h, inertia=np.zeros_like(d), tangent_at=d, shift=np.zeros_like(d))
+
+    def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
+        """Return the new equilibrium, at rest."""
+        return Motion(motion.displacement + h * w, np.zeros_like(w), (w,), h)
+
+
+def relinearised(stage: Stage, w: np.ndarray) -> Stage:
+    """Return the same equation, linearised where the solution w brings the nodes: Newton's iterate.
+
+    d~ = D0 + k w and D0 - d~ = -k w, so that  A w - b  is the residual of the nonlinear equation at w.
+    """
+    move = stage.k * w
+    return Stage(stage.a, stage.k, stage.inertia, stage.tangent_at + stage.shift + move, -move)
+
+
 #: The scene's ``time.integrator`` by name.
-INTEGRATORS: dict[str, type[Newmark] | type[Bdf2] | type[Midpoint]] = {
+INTEGRATORS: dict[str, Callable[[], Integrator]] = {
     "newmark": Newmark,
     "bdf2": Bdf2,
     "midpoint": Midpoint,
+    "symplectic-euler": SymplecticEuler,
+    "static": Static,
 }

@@ -92,6 +92,10 @@ def skipped(scene: Scene) -> list[str]:
             out.append("obstacles: there are none")
         if not scene.solids:
             out.append("geometry after the first step: sides and obstacles do not move, the matrix stays")
+    if scene.time.integrator == "symplectic-euler" and scene.fluid is None:
+        out.append("solver: the mass is lumped, A is diagonal; no option under -fsi_ is read")
+    if scene.time.integrator == "static":
+        out.append("inertia: the integrator is static")
     if scene.gravity is None:
         out.append("gravity: not given")
     if scene.solids and all(s.damping.mass == 0 and s.damping.stiffness == 0 for s in scene.solids.values()):

@@ -42,6 +42,14 @@ class ClosedRegions:
         self.volumes = np.zeros(0)
         self._number: np.ndarray | None = None
         self._found_for: tuple[int, ...] | None = None
+        self._before = self._tracked()
+
+    def _tracked(self) -> tuple[np.ndarray | None, np.ndarray]:
+        return self._number, self.volumes
+
+    def rewind(self) -> None:
+        """Go back to the regions of before the last ``refresh`` that found any changed."""
+        (self._number, self.volumes), self._found_for = self._before, None
 
     def adopt(self, system: System) -> None:
         """Speak to another system of the same fields from now on."""
@@ -53,7 +61,7 @@ class ClosedRegions:
         version = (fluid.geometry_version, *(coupling.n_assembled for coupling in system.couplings))
         if version == self._found_for:
             return
-        self._found_for = version
+        self._found_for, self._before = version, self._tracked()
         touched = next((coupling.touched for coupling in system.couplings), None)
         regions = fluid.closed_regions(touched)
         self._members = [member for member, _ in regions]

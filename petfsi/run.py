@@ -87,7 +87,9 @@ class Run:
     def open(self, after: int | None = None) -> None:
         """Open what the run writes; of a run that goes on drop all after a step. Collective."""
         simulation = self.simulation
-        columns = column_names(simulation.probe_columns(), [*ACCOUNTS, *simulation.accounts.columns])
+        simulation.report = self.console.note
+        others = [*self.effort(), *ACCOUNTS, *simulation.accounts.columns]
+        columns = column_names(simulation.probe_columns(), others)
         self.history = History(self.files.history, columns, self.comm)
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
         if after is not None:
@@ -165,6 +167,12 @@ class Run:
         if scene.checkpoint.every and not final and self._due(scene.checkpoint.every):
             self.checkpoint()
 
+    def effort(self) -> dict[str, int]:
+        """Return what the last step took besides iterations; what no step of the scene can take is left out."""
+        simulation = self.simulation
+        newton = {"newton": simulation.outcome.newton} if simulation.solver.iterates else {}
+        return newton | ({"substeps": simulation.substeps} if simulation.divides else {})
+
     def append_row(self) -> None:
         """Add the present state to the history. Collective."""
         simulation = self.simulation
@@ -177,6 +185,7 @@ class Run:
                 **self.probes,
                 "iterations": simulation.outcome.iterations,
                 "residual": simulation.outcome.residual,
+                **self.effort(),
                 "volume_error": simulation.volume_error,
                 "divergence": simulation.divergence(),
                 **simulation.accounts.values,
@@ -205,7 +214,7 @@ class Run:
             self.comm,
             simulation.scene.checkpoint.keep,
         )
-        simulation.solver.reset()
+        simulation.forget()
 
     def summarise(self, status: Status) -> None:
         """Write summary.json. Collective."""
@@ -295,7 +304,7 @@ def resume_run(
                 f"{directory}: no checkpoint can be read; start again with 'petfsi run {files.scene} --out ...'"
             )
         unread = simulation.prepare()  # of the scene's start: it would move the fluid's faces to the restored solid
-        simulation.solver.reset()
+        simulation.forget()
         with checkpoints.read_checkpoint(found, comm) as stored:
             simulation.restore(stored.step, stored.time, stored.dt, stored.group)
         _greet(console, simulation, unread)

@@ -11,12 +11,15 @@ from mpi4py import MPI
 
 from petfsi import build, petsc
 from petfsi.accounts import Accounts
+from petfsi.couplings.base import Coupling
+from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import SolveError
-from petfsi.fields.base import FluidField, Reader, Slab, SolidField
+from petfsi.fields.base import Field, FluidField, Reader, Slab, SolidField
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 from petfsi.solve import Outcome, Solver
+from petfsi.substeps import StableStep
 from petfsi.system import System
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
@@ -29,10 +32,14 @@ class Simulation:
     ----------
     step, time, dt : int, float, float
         The present step number, its time (s) and the length of the step that led there (s; at first of the next).
+    substeps : int
+        Into how many the last step was divided: because an explicit scheme needs shorter ones, or a solve failed.
+    report : callable
+        Is told in a line what a user should know of a step.
     outcome : Outcome
-        What the last solve reported.
+        What the solves of the last step reported.
     volume_error : float
-        Largest relative change of a closed region's fluid volume in the last step, |sum of net outflows| h / V.
+        Largest relative change of a closed region's fluid volume in a (sub-)step, |sum of net outflows| h / V.
         A split solve spreads a compatible correction over the region: then this is its size.
     accounts : Accounts
         Momentum, energy and volumes, from ``prepare`` on.
@@ -52,12 +59,27 @@ class Simulation:
         if self.solid and self.fluid:
             self.solid.set_scale(self.fluid.density * self.fluid.cell_volume)
         self.system = System(comm, self.fields, self.couplings)
-        self.solver = Solver(self.system)
+        self.solver = self._make_solver()
+        self.stable = StableStep(self.solid, scene.time)
+        # an explicit step fails for being too long, which is found before it is taken
+        self._retries = 0 if self.stable.limited else scene.time.retries
+        self.substeps = 1
+        self.report: Callable[[str], None] = lambda text: None
         self.regions = ClosedRegions(self.system, self.fluid, self.solver.decoupled) if self.fluid else None
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
+
+    def _make_solver(self) -> Solver | DiagonalSolver:
+        if self.solid and self.solid.explicit and len(self.fields) == 1:
+            return DiagonalSolver(self.system)
+        return Solver(self.system, static=self.scene.time.integrator == "static")
+
+    @property
+    def divides(self) -> bool:
+        """Whether a step may be divided."""
+        return self._retries > 0 or self.stable.divides
 
     @property
     def finished(self) -> bool:
@@ -72,7 +94,7 @@ class Simulation:
         self.phases[name] += clock.perf_counter() - start
 
     def advance(self) -> None:
-        """Take one step. Collective.
+        """Take one step, in several if it must be divided. Collective.
 
         Raises
         ------
@@ -81,6 +103,27 @@ class Simulation:
         """
         t = self.time
         dt = self.dt = self._stepping.length(t)
+        n = self.stable.count(t, dt)
+        self.substeps, self.outcome, self.volume_error = 0, Outcome(0, 0.0), 0.0
+        for number in range(n):
+            self._take(t + number * dt / n, dt / n, self._retries)
+        self.step += 1
+        self.time = self._stepping.after(self.step, t, dt)
+
+    def _take(self, t: float, dt: float, retries: int) -> None:
+        """Take a step, or two halves in its place if it fails and so on, at most ``retries`` times. Collective."""
+        try:
+            self._attempt(t, dt)
+        except SolveError as error:
+            if retries == 0:
+                raise
+            why = str(error).split(": ")[0]
+            self.report(f"t = {t:.6g} s: the step of {dt:g} s is taken again as two halves: {why}")
+            self._rewind()
+            self._take(t, dt / 2, retries - 1)
+            self._take(t + dt / 2, dt / 2, retries - 1)
+
+    def _attempt(self, t: float, dt: float) -> None:
         with self.phase("predict"):
             for field in self.fields:
                 field.predict(t, dt)
@@ -90,18 +133,32 @@ class Simulation:
         with self.phase("assemble"):
             changed = self._assemble(t, dt)
         with self.phase("solve"):
-            self.outcome = self.solver.solve(changed)
+            outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt))
         with self.phase("accept"):
             self._accept(t, dt)
             petsc.collect_garbage()
-        self.step += 1
-        self.time = self._stepping.after(self.step, t, dt)
+        self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
+
+    def _rewind(self) -> None:
+        """Put everything back to before the step that has failed; nothing of it was accepted. Collective."""
+        parts: list[Field | Coupling] = [*self.fields, *self.couplings]
+        for part in parts:
+            part.rewind()
+        if self.regions:
+            self.regions.rewind()
+        self.solver.reset()
+
+    def forget(self) -> None:
+        """Forget what a resumed run could not know: it must go on in the same way. Collective."""
+        self.solver.reset()
+        self.stable.forget()
 
     def prepare(self) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
 
         Collective. Returns the options of others that nothing reads.
         """
+        self.stable.count(self.time, self.dt)
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
         self._assemble(self.time, self.dt)
@@ -123,11 +180,22 @@ class Simulation:
             self.regions.refresh()
         return changed
 
+    def _restage(self, values: list[np.ndarray], t: float, dt: float) -> bool:
+        """Make the system that of other values of the fields; return whether the operator has changed. Collective."""
+        # not any(): every field must hear
+        if not sum([field.relinearise(x) for field, x in zip(self.fields, values, strict=True)]):
+            return False
+        parts: list[Field | Coupling] = [*self.fields, *self.couplings]
+        for part in parts:
+            part.assemble(t, dt)
+        return self.system.refresh(guess=False)
+
     def _accept(self, t: float, dt: float) -> None:
-        self.volume_error = self.regions.volume_error(dt) if self.regions else 0.0
+        if self.regions:
+            self.volume_error = max(self.volume_error, self.regions.volume_error(dt))
         values = dict(zip((field.name for field in self.fields), self.system.values(), strict=True))
         if self.solid:
-            self._check_speed(self.solid, values["solid"])
+            self._check_speed(self.solid, values["solid"], dt)
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
             coupling.accept(t, dt)
@@ -135,15 +203,17 @@ class Simulation:
             self.fluid.accept(values["pressure"], t, dt)
         self.accounts.update(values.get("pressure"), dt)
 
-    def _check_speed(self, solid: SolidField, velocity: np.ndarray) -> None:
+    def _check_speed(self, solid: SolidField, velocity: np.ndarray, dt: float) -> None:
         """Raise if a node would cross the whole scene in one step: the state has blown up."""
         along = velocity.reshape(-1, solid.width)[:, : self.scene.dim]  # a beam's rotations are no way to go
         fastest = self.comm.allreduce(float(np.abs(along).max(initial=0.0)), MPI.MAX)
         extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
-        if not fastest * self.dt < extent:
+        if self.stable.limited:
+            self.stable.moved(fastest * dt)
+        if not fastest * dt < extent:
             raise SolveError(
                 f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
-                f"in one step of {self.dt:g} s. A splitting scheme fails like this where the fluid that moves with the "
+                f"in one step of {dt:g} s. A splitting scheme fails like this where the fluid that moves with the "
                 f"solid outweighs it, at small steps most of all: try monolithic.opts. Else more damping, a smaller dt."
             )
 

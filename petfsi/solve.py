@@ -16,6 +16,7 @@ from petfsi import petsc
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import FluidField
 from petfsi.multigrid import Hierarchy
+from petfsi.newton import Newton, Restage, as_it_is, snes_type
 from petfsi.pressure_solver import PressureSolver
 from petfsi.system import System
 
@@ -100,10 +101,26 @@ def dump_options() -> str:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solve reports: iterations (of the pressure's solver where the outer one only applies it), |b - Kx|/|b|."""
+    """What the solves of a step report.
+
+    Attributes
+    ----------
+    iterations : int
+        Of all linear solves; of the pressure's solver where the outer one only applies it.
+    residual : float
+        Largest |b - Kx|/|b|.
+    newton : int
+        Newton's iterations.
+    """
 
     iterations: int
     residual: float
+    newton: int = 0
+
+    def __add__(self, other: Outcome) -> Outcome:
+        """Return the outcome of both."""
+        residual = max(self.residual, other.residual)
+        return Outcome(self.iterations + other.iterations, residual, self.newton + other.newton)
 
 
 class Solver:
@@ -113,15 +130,25 @@ class Solver:
     that is alone is solved as the options say for the whole, or, where they split the whole into fields, as they
     say for that field.
 
+    Parameters
+    ----------
+    system : System
+    static : bool
+        Whether Newton's method is the default.
+
     Attributes
     ----------
     decoupled : bool
         Whether each block is inverted by itself (a fieldsplit other than Schur's), so that a region closed by
         an elastic wall is singular to the pressure block though not to the system.
+    iterates : bool
+        Whether each step is solved by Newton's method.
     """
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, static: bool = False) -> None:
         self.system = system
+        self._static = static
+        self.iterates = snes_type(PREFIX, static) != "ksponly"
         single = len(system.fields) == 1
         splits = PETSc.Options(PREFIX).getString("pc_type", "") == PETSc.PC.Type.FIELDSPLIT
         self.prefix = field_prefix(system.fields[0].name) if single and splits else PREFIX
@@ -134,10 +161,16 @@ class Solver:
         self.decoupled = not single and splits and split != "schur"
         # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
         self.fixed_iterations = options.getString("ksp_convergence_test", "default") == "skip"
+        if self.fixed_iterations and self.iterates:
+            raise InputError(
+                f"option -{PREFIX}snes_type newtonls: wants linear systems solved, and -{self.prefix}"
+                f"ksp_convergence_test skip takes a fixed number of iterations; try split-iterated.opts"
+            )
         self._ksp: PETSc.KSP | None = None
         self._monolith: PETSc.Mat | None = None
         self._pressure: PressureSolver | None = None
         self._hierarchy: Hierarchy | None = None
+        self._newton: Newton | None = None
         self._inner_iterations = 0
 
     def set_up(self) -> None:
@@ -210,40 +243,72 @@ class Solver:
         if self._ksp is not None:
             self._release()
             self._ksp = self._pressure = None
+        if self._newton is not None:
+            self._newton.release()
+            self._newton = None
 
     def adopt(self, system: System) -> None:
         """Solve another system of the same fields from now on. Collective."""
         self.reset()
         self.system, self._monolith = system, None
 
-    def solve(self, changed: bool) -> Outcome:
+    def solve(self, changed: bool, restage: Restage = as_it_is) -> Outcome:
         """Solve for the system's solution, from its first guess. Collective.
 
         Parameters
         ----------
         changed : bool
             Whether the operator differs from that of the last call.
+        restage : callable
+            Makes the system that of other values of the fields, for Newton's method.
 
         Raises
         ------
         SolveError
             On every rank, with the reason and the residual of each field.
         """
-        if changed or self._ksp is None:
+        changed = changed or self._ksp is None
+        if self.iterates:
+            if self._ksp is None:
+                self.set_up()
+            newton, iterations, residual = self._iteration().solve(changed, restage)
+            return Outcome(iterations, residual, newton)
+        if changed:
             self.set_up()
-        ksp, system = self._ksp, self.system
+        iterations, norms = self.solve_linear(self.system.rhs, self.system.solution)
+        return Outcome(iterations, norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0)
+
+    def _iteration(self) -> Newton:
+        if self._newton is None:
+            # full steps nearly always do where there is inertia; in statics the residual often has to grow first
+            self._newton = Newton(self.system, self, PREFIX, "l2" if self._static else "bt")
+        return self._newton
+
+    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> tuple[int, dict[str, float]]:
+        """Solve for x, from what it holds, with the operator as it was set up. Collective.
+
+        Returns
+        -------
+        int, dict of str to float
+            Iterations, and the residual's norms (see ``System.update_residual``).
+
+        Raises
+        ------
+        SolveError
+            On every rank, with the reason and the residual of each field.
+        """
+        ksp = self._ksp
         assert ksp is not None
         self._inner_iterations = 0
         if self._pressure is not None and ksp.getType() != PETSc.KSP.Type.PREONLY:
-            self._pressure.aim(ksp.getTolerances()[0] * system.rhs.norm())
+            self._pressure.aim(ksp.getTolerances()[0] * b.norm())
         try:
-            ksp.solve(system.rhs, system.solution)
+            ksp.solve(b, x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{self.prefix}' broke down: {_petsc_text(error)}") from None
-        norms = system.update_residual()
+        norms = self.system.update_residual(x, b)
         self._judge(ksp, norms)
-        relative = norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0
-        return Outcome(max(self._inner_iterations, ksp.getIterationNumber()), relative)
+        return max(self._inner_iterations, ksp.getIterationNumber()), norms
 
     def _judge(self, ksp: PETSc.KSP, norms: dict[str, float]) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
@@ -282,6 +347,8 @@ class Solver:
         """
         self.set_up()
         assert self._ksp is not None
+        if self.iterates:
+            self._iteration()
         try:
             self._ksp.getPC().apply(self.system.rhs, self.system.residual)
         except PETSc.Error as error:
@@ -289,14 +356,18 @@ class Solver:
         unread = petsc.unread_options(PREFIX)
         if not self.system.index_sets:  # options of the others wait for a scene that couples
             others = f"{PREFIX}fieldsplit_" if self.prefix == PREFIX else "-"
-            unread = [name for name in unread if name.startswith(self.prefix) and not name.startswith(others)]
+            mine = (self.prefix, f"{PREFIX}snes_")
+            unread = [name for name in unread if name.startswith(mine) and not name.startswith(others)]
         if unread:
             every = PETSc.Options().getAll()
             known = sorted(set(COMMON) | {n.removeprefix(self.prefix) for n in every if n not in unread})
             lines = []
             for name in unread:
-                near = get_close_matches(name.removeprefix(self.prefix), known, 1)
-                hint = f"; did you mean -{self.prefix}{near[0]}?" if near else ""
+                prefix = PREFIX if name.startswith(f"{PREFIX}snes_") else self.prefix
+                near = get_close_matches(name.removeprefix(prefix), known, 1)
+                hint = f"; did you mean -{prefix}{near[0]}?" if near else ""
+                if near and f"{prefix}{near[0]}" == name:
+                    hint = f"; it needs -{PREFIX}snes_type newtonls"
                 lines.append(f"option -{name}: no solver of this scene reads it{hint}")
             raise InputError("\n".join(lines))
         return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
@@ -309,11 +380,12 @@ def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
 
 
 #: How the names of options end that mean nothing without a value.
-VALUED = ("_type", "_rtol", "_atol", "_divtol", "_max_it")
+VALUED = ("_type", "_rtol", "_atol", "_stol", "_divtol", "_max_it")
 #: Names worth suggesting for a misspelt option, besides those in force.
 COMMON = (
     "ksp_type ksp_rtol ksp_atol ksp_max_it ksp_monitor ksp_view ksp_pc_side ksp_norm_type "
     "ksp_initial_guess_nonzero ksp_convergence_test ksp_converged_reason pc_type pc_fieldsplit_type mat_type "
+    "snes_type snes_rtol snes_atol snes_stol snes_max_it snes_monitor snes_linesearch_type snes_converged_reason "
     "pc_fieldsplit_schur_fact_type pc_fieldsplit_schur_precondition pc_factor_mat_solver_type"
 ).split()
 

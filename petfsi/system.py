@@ -72,10 +72,13 @@ class System:
         blocks += [block for coupling in self.couplings for block in coupling.blocks.values()]
         return [block.handle for block in blocks]
 
-    def refresh(self) -> bool:
-        """Scale what was assembled anew, fill right-hand side and first guess; say whether the operator changed.
+    def refresh(self, guess: bool = True) -> bool:
+        """Scale what was assembled anew, fill the right-hand side; say whether the operator changed. Collective.
 
-        Collective.
+        Parameters
+        ----------
+        guess : bool
+            Whether to fill the solution, too: with the fields' present values.
         """
         changed = False
         scales = {field.name: (field.row_scale, field.col_scale) for field in self.fields}
@@ -92,7 +95,8 @@ class System:
             self.operator.assemble()  # else Schur complements formed by PETSc keep the old values
         for field, piece in zip(self.fields, self._pieces, strict=True):
             self.rhs.array[piece] = field.row_scale * field.rhs
-            self.solution.array[piece] = field.unknown() / field.col_scale
+            if guess:
+                self.solution.array[piece] = field.unknown() / field.col_scale
         return changed
 
     def _is_new(self, part: Field | Coupling, count: int) -> bool:
@@ -100,11 +104,15 @@ class System:
         self._seen[part] = count
         return new
 
-    def update_residual(self) -> dict[str, float]:
-        """Compute rhs - operator * solution and return its norm by field, and of all under ``""``. Collective."""
-        self.operator.mult(self.solution, self.residual)
-        self.residual.aypx(-1.0, self.rhs)
-        r, b = self.residual.array, self.rhs.array
+    def update_residual(self, x: PETSc.Vec | None = None, b: PETSc.Vec | None = None) -> dict[str, float]:
+        """Compute b - operator * x and return its norm by field, and of all under ``""``. Collective.
+
+        x and b are solution and rhs if not given.
+        """
+        x, b = x or self.solution, b or self.rhs
+        self.operator.mult(x, self.residual)
+        self.residual.aypx(-1.0, b)
+        r, b = self.residual.array_r, b.array_r
         squares = [r[piece] @ r[piece] for piece in self._pieces] + [b @ b]
         total = np.sqrt(self.comm.allreduce(np.array(squares)))
         norms = {field.name: float(n) for field, n in zip(self.fields, total, strict=False)}
@@ -112,9 +120,9 @@ class System:
         norms["rhs"] = float(total[-1])
         return norms
 
-    def values(self) -> list[np.ndarray]:
-        """Return the solution of each field on this rank, SI."""
-        x = self.solution.array
+    def values(self, of: PETSc.Vec | None = None) -> list[np.ndarray]:
+        """Return the solution (or another vector) of each field on this rank, SI."""
+        x = (self.solution if of is None else of).array_r
         return [x[piece] * field.col_scale for field, piece in zip(self.fields, self._pieces, strict=True)]
 
     def piece(self, name: str) -> slice:

@@ -20,7 +20,7 @@ from petsc4py import PETSc
 
 from petfsi.errors import InputError
 from petfsi.fields.mac import kinds
-from petfsi.integrators import INTEGRATORS
+from petfsi.fields.mac.transport import TRANSPORTS
 
 
 def times(fluid, values):
@@ -230,7 +230,7 @@ def test_output_is_centred_in_the_cells():
 
 
 @pytest.mark.parallel([1, 3])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", TRANSPORTS)
 @pytest.mark.parametrize("cells", [(24, 20), (12, 12, 18)])
 def test_a_restored_fluid_goes_on_as_the_first_one(cells, integrator):
     dim = len(cells)

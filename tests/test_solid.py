@@ -239,7 +239,7 @@ def test_midpoint_keeps_the_energy_of_small_swings():
     assert left["newmark"][-1] < 0.5
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", [name for name in INTEGRATORS if name != "static"])
 def test_any_integrator_lets_a_free_body_fall_without_deforming(dim, integrator):
     solid = field(dim, gravity=[0.0, -9.81, 0.0][:dim], integrator=integrator, b=body(dim))
     h, n = 0.05, 10

@@ -47,6 +47,10 @@ class Coupling(ABC):
         """
 
     @abstractmethod
+    def rewind(self) -> None:
+        """Forget for which positions the operators are: the fields forget the step that was tried."""
+
+    @abstractmethod
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return this rank's share of what the coupling's own forces did in the step last accepted.
 

@@ -112,6 +112,10 @@ class CutCellCoupling(Coupling):
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
 
+    def rewind(self) -> None:
+        """Make the operators anew, and the fluid's cells with them, in the next step."""
+        self._positions = None
+
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return the work of the fluid's weight on all points, and what supports do against it and the pressure."""
         held = free = 0.0

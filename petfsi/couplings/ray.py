@@ -224,6 +224,10 @@ class RayCoupling(Coupling):
             self._held_outflow = self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
             self.fluid.rhs -= self._held_outflow
 
+    def rewind(self) -> None:
+        """Make the operators anew, and the fluid's cells with them, in the next step."""
+        self._positions = None
+
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return what supports do against the pressure, as the fluid feels it."""
         held = self._held_outflow

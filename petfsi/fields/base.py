@@ -129,6 +129,33 @@ class Field(ABC):
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the solution (SI) of the step from ``time`` to ``time + dt`` and move all that moves with it."""
 
+    def rewind(self) -> None:
+        """Forget the step that ``predict`` began and that will not be accepted, as if it had not been tried."""
+        return
+
+    def linearised_at(self) -> np.ndarray:
+        """Return the values (SI) at which ``block`` is the derivative: where Newton's method begins."""
+        return self.unknown()
+
+    def round_off(self, x: np.ndarray) -> float:
+        """Return what ``block @ x - rhs`` cannot fall below, eps ||block|| ||x||, in the solver's units. Collective.
+
+        Parameters
+        ----------
+        x : ndarray, shape (layout.n_local,)
+            SI.
+        """
+        comm = self.block.comm.tompi4py()
+        length = float(np.sqrt(comm.allreduce(float(x @ x)))) / self.col_scale
+        return float(np.finfo(float).eps) * self.block.norm(PETSc.NormType.NORM_INFINITY) * length
+
+    def relinearise(self, x: np.ndarray) -> bool:
+        """Let ``assemble`` linearise about these values (SI) until ``accept``; return whether that changes anything.
+
+        ``block @ x - rhs`` is then the residual of the nonlinear equation at x. Interfaces stay where they are.
+        """
+        return False
+
     @abstractmethod
     def stock(self) -> Stock:
         """Return this rank's share of momentum and energy. Collective, without a reduction."""
@@ -208,11 +235,24 @@ class SolidField(Field):
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
         By how much this rank's nodes moved in the step last accepted, m.
+    finest : float
+        Length of its shortest edge at rest, m.
+    explicit : bool
+        Whether its block is diagonal and its step limited, see ``stable_step``.
+    is_linear : bool
+        Whether its tangent never changes, and neither does the stable step.
     """
 
     width: int
     extent: float
     moved: np.ndarray
+    finest: float
+    explicit: bool = False
+    is_linear: bool = False
+
+    @abstractmethod
+    def stable_step(self) -> float:
+        """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:

@@ -17,7 +17,7 @@ from petfsi.output import files
 from petfsi.ranks import on_root
 
 #: The columns that hold whole numbers.
-WHOLE = ("step", "iterations")
+WHOLE = ("step", "iterations", "newton", "substeps")
 
 
 def column_names(probes: Sequence[str], others: Sequence[str] = ()) -> list[str]:

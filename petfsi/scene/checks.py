@@ -38,8 +38,9 @@ MAX_STEPS = 10**8
 SOLID_QUANTITIES = ("displacement", "velocity")
 #: Columns of history.csv, which a probe must not repeat.
 RESERVED_PROBES = (
-    "step", "time", "dt", "iterations", "residual", "volume_error", "divergence", "region_volume", "momentum",
-    "kinetic", "elastic", "potential", "dissipated", "load_work", "boundary_work", "energy_residual",
+    "step", "time", "dt", "iterations", "residual", "newton", "substeps", "volume_error", "divergence",
+    "region_volume", "momentum", "kinetic", "elastic", "potential", "dissipated", "load_work", "boundary_work",
+    "energy_residual",
 )  # fmt: skip
 
 
@@ -94,6 +95,24 @@ def _time(scene: Scene) -> Problems:
     elif stepping.constant and not time.end / dt <= MAX_STEPS:
         allowed = f"makes {time.end / dt:.3g} steps to time.end = {time.end:g} s; at most {MAX_STEPS:.0e} may be"
         yield Problem("time.dt", time.dt, allowed, ("time.end",))
+
+
+def _static(scene: Scene) -> Problems:
+    """Refuse what has no meaning where nothing moves by itself."""
+    if scene.time.integrator != "static":
+        return
+    uses = ("time.integrator",)
+    if scene.fluid is not None:
+        yield Problem("time.integrator", "static", "finds the equilibrium of solids; take out the [fluid]", ("fluid",))
+    for name, solid in scene.solids.items():
+        key = f"solids.{name}"
+        if solid.initial.velocity is not None:
+            allowed = "nothing has a velocity in statics: leave it out"
+            yield Problem(f"{key}.initial.velocity", solid.initial.velocity, allowed, uses)
+        for kind in ("mass", "stiffness"):
+            if getattr(solid.damping, kind) != 0:
+                allowed = "nothing is damped in statics: leave it out, or 0"
+                yield Problem(f"{key}.damping.{kind}", getattr(solid.damping, kind), allowed, uses)
 
 
 # ---- fluid --------------------------------------------------------------------------------------------------
@@ -324,6 +343,7 @@ CHECKS: tuple[Callable[[Scene], Problems], ...] = (
     _contents,
     _names,
     _time,
+    _static,
     _fluid,
     _sides,
     _solids,

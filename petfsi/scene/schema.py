@@ -58,7 +58,11 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Number, Field(description="s")]
-    integrator: Literal["newmark", "bdf2", "midpoint"] = "newmark"
+    integrator: Literal["newmark", "bdf2", "midpoint", "symplectic-euler", "static"] = "newmark"
+    above_limit: Annotated[
+        Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
+    ] = "refuse"
+    retries: Annotated[Whole, Field(ge=0, le=20, description="how often a step that fails is halved")] = 3
 
     @field_validator("dt")
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -21,6 +21,12 @@ from petfsi.scene.schema import Scene
 if TYPE_CHECKING:
     from petfsi.fields.mac.cut import Walls, Wet
     from petfsi.fields.mac.cutgrid import CutGrid, Openings
+
+
+#: What a step replaces before it is solved; none of it is changed in place.
+REPLACED = (
+    "cell_kind", "face_kind", "openness", "volume", "extras", "index", "layout", "block", "rhs",
+)  # fmt: skip
 
 
 class CoveredGrid(FluidField):
@@ -77,6 +83,7 @@ class CoveredGrid(FluidField):
         self._pattern = pressure.Pattern(grid)
         self._assembled_for: tuple[int, float] | None = None
         self._new_pattern = True
+        self._before: dict[str, Any] = {}
 
     def _uncover(self) -> None:
         """Start with what obstacles leave. Collective."""
@@ -148,6 +155,19 @@ class CoveredGrid(FluidField):
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.geometry_version += 1
         return found.walls, found.wet
+
+    def _remember(self, *more: str) -> None:
+        """Keep what ``rewind`` puts back: attributes that are replaced, never changed in place."""
+        self._before = {name: getattr(self, name) for name in (*REPLACED, *more)}
+
+    def rewind(self) -> None:
+        """Put the grid back to how it was covered before the step. Collective."""
+        for name, value in self._before.items():
+            setattr(self, name, value)
+        self._before = {}
+        self.geometry_version += 1
+        self._kinds_changed()
+        self._assembled_for, self._new_pattern = None, True
 
     def _renumber(self, found: Openings) -> None:
         """Take over the unknowns of split cells; the others keep their place. Collective."""

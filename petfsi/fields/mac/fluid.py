@@ -130,6 +130,7 @@ class MacFluid(CoveredGrid):
 
     def predict(self, time: float, dt: float) -> None:
         """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
+        self._remember("smoke", "_extra_pressure")
         transport = self._transport
         transport.predict(self.velocity, self._moved, dt, self.velocity_star)
         moment, smoke = transport.moment(dt), self.smoke

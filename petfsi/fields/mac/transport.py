@@ -123,7 +123,7 @@ class Advection:
 
 
 class Transport:
-    """First order, for Newmark's scheme:  v*(x) = v^n(x_d), where x_d comes to x along v^n.
+    """First order, for Newmark's and the symplectic scheme:  v*(x) = v^n(x_d), where x_d comes to x along v^n.
 
     Attributes
     ----------
@@ -322,4 +322,5 @@ TRANSPORTS: dict[str, type[Transport]] = {
     "newmark": Transport,
     "bdf2": Bdf2Transport,
     "midpoint": MidpointTransport,
+    "symplectic-euler": Transport,
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -12,12 +13,13 @@ from petsc4py import PETSc
 
 from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.lumped import LumpedEquation
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
-from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage
+from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, relinearised, stable_step
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
@@ -28,8 +30,25 @@ from petfsi.scene.stepping import Stepping
 class ElementLibrary(Protocol):
     """What a solid's elements offer; arrays are over all local nodes, shape (n, width), but for ``b`` (owned ones)."""
 
+    @property
+    def constant(self) -> bool:
+        """Whether K' never changes."""
+        ...
+
     def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
         """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective."""
+        ...
+
+    def forces(self, at: State, b: np.ndarray) -> None:
+        """Fill b alone, without a matrix. Not collective."""
+        ...
+
+    def lumped_mass(self, n: int) -> np.ndarray:
+        """Return the diagonal of the lumped mass at the first ``n`` nodes, shape (n, width), kg."""
+        ...
+
+    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
+        """Return no less than the largest eigenvalue of M^-1 K'(d), M diagonal, of these elements, 1/s^2."""
         ...
 
     def uniform_load(self, n: int) -> np.ndarray:
@@ -49,6 +68,11 @@ class ElementLibrary(Protocol):
 
 class LoadLibrary(Protocol):
     """What a solid's loads offer; arrays as of ``ElementLibrary``."""
+
+    @property
+    def follow(self) -> bool:
+        """Whether any of them depends on the displacement."""
+        ...
 
     def assemble(self, time: float, at: State, k: float, values: np.ndarray | None, b: np.ndarray) -> None:
         """Add  f(d~) + f' s  to b and  -k f'  to A's values, where forces depend on d. Collective."""
@@ -100,6 +124,11 @@ class NodalSolid(SolidField):
         self.width = len(components)
         self.names = list(solids)
         self.extent = float(np.ptp(mesh.points, axis=0).max())
+        self.finest = _shortest_edge(mesh)
+        self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
+        self.explicit = self._integrator.explicit
+        if self.explicit:
+            solids = {name: solid.model_copy(update={"mass": "lumped"}) for name, solid in solids.items()}
         self._node_body = np.empty(len(mesh.points), dtype=np.int32)
         self._node_body[mesh.cells] = mesh.body[:, None]
         self._mesh, self._number = distribute(comm, mesh)
@@ -107,16 +136,18 @@ class NodalSolid(SolidField):
         self.reference = self._mesh.points[:n_owned]
         self.layout = Layout.of(comm, self.width * n_owned)
         self._elements = self._make_elements(solids)
-        self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
         self._uniform = self._elements.uniform_load(n_owned)
         self._reference_mass = comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points)
 
         self._tags = on_root(comm, lambda: _tags(scene, solids, mesh))
         self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
+        self._set_exchange(mesh)
+        self._damping = np.array([[solid.damping.mass, solid.damping.stiffness] for solid in solids.values()])
+        self._lumped = self._lump() if self.explicit else None
         self._set_pattern()
         self._loads = self._make_loads(mesh, solids)
-        self._set_exchange(mesh)
+        self.is_linear = self._elements.constant and not (self._loads is not None and self._loads.follow)
         self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
 
     @abstractmethod
@@ -151,20 +182,28 @@ class NodalSolid(SolidField):
         here = (held >= self.layout.start) & (held < self.layout.end)
         local = self.width * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.width)
         self._is_held = np.isin(local, held)
-        damping = [(solid.damping.mass, solid.damping.stiffness) for solid in solids.values()]
-        self._loses = self._supports.move or bool(np.any(damping))
+        self._loses = self._supports.move or bool(np.any(self._damping))
         self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
         placed = self._supports.placed
         here = here[placed]
         self.displacement.reshape(-1)[held[placed][here] - self.layout.start] = self._supports.displacements(0.0)[here]
 
+    def _lump(self) -> LumpedEquation:
+        damping = self._damping[self._node_body[self._mesh.natural[: self._mesh.n_owned]]]
+        mass = self._elements.lumped_mass(self._mesh.n_owned)
+        return LumpedEquation(self.layout, mass, damping[:, 0], damping[:, 1], self._supports.unknowns)
+
     def _set_pattern(self) -> None:
-        self._pattern = Pattern.of(self._mesh, self.width)
-        self._elimination = Elimination(self._pattern, self.layout, self._supports.unknowns)
-        self._values = np.zeros(len(self._pattern.indices))
         self.rhs = np.zeros(self.layout.n_local)
         self.block = new_block(self.comm, self.layout, self.layout, block_size=self.width)
-        set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=True)
+        rows: Pattern | LumpedEquation
+        if self._lumped is None:
+            rows = self._pattern = Pattern.of(self._mesh, self.width)
+            self._elimination = Elimination(self._pattern, self.layout, self._supports.unknowns)
+        else:
+            rows = self._lumped
+        self._values = np.zeros(len(rows.indices))
+        set_csr(self.block, rows.indptr, rows.indices, self._values, new_pattern=True)
         vectors = []
         for mode in self.near_null_space():
             vector = self.block.createVecRight()
@@ -172,6 +211,7 @@ class NodalSolid(SolidField):
             vectors.append(vector)
         self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
         self._diagonal = (0.0, 0.0), 1.0
+        self._assembled_for = 0.0, 0.0
 
     def _set_exchange(self, mesh: SimplexMesh) -> None:
         """Prepare the messages between owned, shared and naturally ordered nodes."""
@@ -195,25 +235,95 @@ class NodalSolid(SolidField):
 
     def assemble(self, time: float, dt: float) -> None:
         """Refresh A and b for the step from ``time`` to ``time + dt``. Collective."""
+        if self._lumped is not None:
+            self._assemble_lumped(self._lumped, time, dt)
+            return
         stage = self._stage or self._integrator.stage(self._motion(), dt)
         b = self.rhs.reshape(-1, self.width)
         diagonal = self._mean_diagonal(stage)
         local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
         state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
         self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
-        gravity = np.zeros(self.dim)
-        for axis, g in enumerate(self._gravity):
-            gravity[axis] = float(g(t=time + self._integrator.moment(dt)))
-            if gravity[axis]:
-                b += gravity[axis] * self._uniform[axis]
-        if self._loads is not None:
-            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, self._values, b)
-        self._loaded = stage, state, gravity
+        self._loaded = stage, state, self._add_weight(time, dt)
+        self._add_loads(time, dt, stage, state)
         self._prescribe(stage, time, dt)
         self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
         set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
         self.row_scale = dt / self._reference_mass
         self.n_assembled += 1
+
+    def _assemble_lumped(self, lumped: LumpedEquation, time: float, dt: float) -> None:
+        """Refresh the diagonal A only if the step's length has changed, and b. Collective."""
+        stage, mean = self._stage or self._integrator.stage(self._motion(), dt), self._reference_mass
+        lag = lumped.lag(self.velocity)
+        if lag is not None:
+            stage = replace(stage, shift=lag)
+        # most explicit steps send one array only
+        sent = (stage.tangent_at,) if lag is None else (stage.tangent_at, stage.shift)
+        d, *lags = np.split(self._with_shared(np.concatenate(sent, axis=1)), len(sent), axis=1)
+        rest = np.zeros_like(d)
+        state = State(d, rest, lags[0] if lags else rest)
+        b = self.rhs.reshape(-1, self.width)
+        self._elements.forces(state, b)
+        b += lumped.mass * stage.inertia
+        self._loaded = stage, state, self._add_weight(time, dt)
+        self._add_loads(time, dt, stage, state)
+        if self._loses:
+            self._pull = b.copy()
+        self._prescribe(stage, time, dt)
+        lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
+        if self._assembled_for != (stage.a, mean):
+            self._assembled_for = stage.a, mean
+            set_csr(self.block, lumped.indptr, lumped.indices, lumped.diagonal(stage.a, mean), new_pattern=False)
+            self.n_assembled += 1
+        self.row_scale = dt / mean
+
+    def _add_weight(self, time: float, dt: float) -> np.ndarray:
+        """Add gravity's force to b and return it, m/s^2."""
+        b, gravity = self.rhs.reshape(-1, self.width), np.zeros(self.dim)
+        for axis, g in enumerate(self._gravity):
+            gravity[axis] = float(g(t=time + self._integrator.moment(dt)))
+            if gravity[axis]:
+                b += gravity[axis] * self._uniform[axis]
+        return gravity
+
+    def _add_loads(self, time: float, dt: float, stage: Stage, state: State) -> None:
+        if self._loads is not None:
+            values = None if self.explicit else self._values
+            b = self.rhs.reshape(-1, self.width)
+            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, values, b)
+
+    def linearised_at(self) -> np.ndarray:
+        """Return the w with  D0 + k w = d~."""
+        stage = self._stage
+        return self.unknown() if stage is None or stage.k == 0 else (-stage.shift / stage.k).ravel()
+
+    def round_off(self, x: np.ndarray) -> float:
+        """Return eps ||A|| (||w|| + ||d~|| / k): forces come from positions that were rounded, too. Collective."""
+        stage = self._stage
+        if stage is None or stage.k == 0:
+            return super().round_off(x)
+        return super().round_off(np.concatenate((x, stage.tangent_at.ravel() / stage.k)))
+
+    def relinearise(self, x: np.ndarray) -> bool:
+        """Take K and K' where w brings the nodes; nothing if the step has no K' or K' is always the same."""
+        stage = self._stage
+        if stage is None or stage.k == 0 or self.is_linear:
+            return False
+        self._stage = relinearised(stage, x.reshape(-1, self.width))
+        return True
+
+    def rewind(self) -> None:
+        """Forget the step begun."""
+        self._stage = self._geometry = None
+
+    def stable_step(self) -> float:
+        """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
+        if self._lumped is None:
+            return np.inf
+        shared = self._with_shared(np.concatenate((self.displacement, self._lumped.mass), axis=1))
+        eigenvalue = self._elements.stiffest(shared[:, : self.width], shared[:, self.width :])
+        return stable_step(self.comm.allreduce(eigenvalue, MPI.MAX), float(self._damping[:, 1].max()))
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the velocities w and move the nodes."""
@@ -291,6 +401,10 @@ class NodalSolid(SolidField):
         if not self._loses:
             return Work(gravity=fallen, loads=loaded)
         g = np.where(self._is_held, w, 0.0)
+        if self._lumped is not None:
+            lost, _ = self._elements.powers(state, 0.0, 0.0, w, np.zeros_like(w), self._mesh.counted)
+            done = np.vdot(g[: self._mesh.n_owned], self._lumped.inertia(stage.a, w[: self._mesh.n_owned]) - self._pull)
+            return Work(fallen, dt * lost, dt * float(done), loaded)
         damping, power = self._elements.powers(state, stage.a, stage.k, w, g, self._mesh.counted)
         power -= float(np.vdot(weight, g[: self._mesh.n_owned]))
         return Work(fallen, dt * damping, dt * power, loaded)
@@ -336,6 +450,14 @@ def _tags(scene: Scene, solids: Mapping[str, Solid], mesh: SimplexMesh) -> dict[
         elements = mesh.elements(body)
         found[name] = with_middles(tags, elements - elements.min()) if tags else tags
     return found
+
+
+def _shortest_edge(mesh: SimplexMesh) -> float:
+    """Return the length of the shortest edge of a mesh, m."""
+    corners = mesh.points[mesh.cells]
+    edges = corners[:, :, None] - corners[:, None]
+    a, b = np.triu_indices(mesh.cells.shape[1], 1)
+    return float(np.sqrt((edges[:, a, b] ** 2).sum(axis=-1).min()))
 
 
 def _evaluate(

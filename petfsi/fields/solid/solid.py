@@ -59,7 +59,7 @@ class SimplexSolid(NodalSolid):
                 if load.at is not None:
                     at, key = np.array(load.at), f"solids.{name}.loads.{n}: the force"
                     places[name, n] = locate(self.comm, self._mesh, index, at, key)
-        return Loads(self.comm, solids, bodies, self._mesh, self._pattern, places)
+        return Loads(self.comm, solids, bodies, self._mesh, None if self.explicit else self._pattern, places)
 
     def _make_surface(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Surface:
         number, node_body = self._number, self._node_body

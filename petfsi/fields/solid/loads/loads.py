@@ -61,8 +61,8 @@ class Loads:
     solids : mapping of str to Solid
     bodies : mapping of str to Body
     mesh : LocalMesh
-    pattern : Pattern
-        Of the block; all nodes of a facet must be neighbours in it.
+    pattern : Pattern or None
+        Of the block; all nodes of a facet must be neighbours in it. None for explicit steps, which have no tangent.
     places : mapping of (str, int) to Place
         Of every force at a point: the body and the index of the load.
 
@@ -74,7 +74,7 @@ class Loads:
 
     def __init__(
         self, comm: MPI.Comm, solids: Mapping[str, Solid], bodies: Mapping[str, Body], mesh: LocalMesh,
-        pattern: Pattern, places: Mapping[tuple[str, int], Place],
+        pattern: Pattern | None, places: Mapping[tuple[str, int], Place],
     ) -> None:  # fmt: skip
         self.comm, self._mesh = comm, mesh
         self.dim = mesh.points.shape[1]
@@ -83,7 +83,7 @@ class Loads:
         self._tractions: list[FollowerTraction] = []
         agreed(comm, lambda: self._collect(solids, bodies, places))
         self.follow = bool(self._pressures or self._tractions)
-        self._tangents = [_Tangent(pressure.facets, mesh, pattern) for pressure in self._pressures]
+        self._tangents = [_Tangent(p.facets, mesh, pattern) for p in self._pressures] if pattern is not None else []
         self._force, self._k = np.zeros((mesh.n_owned, self.dim)), 0.0
 
     # ---- set-up -----------------------------------------------------------------------------------------------

@@ -1,0 +1,49 @@
+"""The solver of a field that is alone and has a diagonal block: none."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from petfsi import petsc
+from petfsi.newton import Restage, as_it_is
+from petfsi.solve import PREFIX, Outcome
+from petfsi.system import System
+
+
+class DiagonalSolver:
+    """Divides by the diagonal of the system's operator; has the face of ``solve.Solver`` and reads no option."""
+
+    decoupled = iterates = False
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self._diagonal: np.ndarray | None = None
+
+    def set_up(self) -> None:
+        """Take the operator's diagonal. Collective."""
+        self._diagonal = self.system.operator.getDiagonal().array_r.copy()
+
+    def solver_of(self, name: str) -> PETSc.KSP | None:
+        """Return None: there is none."""
+        return None
+
+    def reset(self) -> None:
+        """Forget the diagonal."""
+        self._diagonal = None
+
+    def adopt(self, system: System) -> None:
+        """Solve another system of the same field from now on."""
+        self.system, self._diagonal = system, None
+
+    def solve(self, changed: bool, restage: Restage = as_it_is) -> Outcome:
+        """Solve for the system's solution; what is not finished is found by its speed."""
+        if changed or self._diagonal is None:
+            self.set_up()
+        self.system.solution.array = self.system.rhs.array_r / self._diagonal
+        return Outcome(0, 0.0)
+
+    def check_options(self) -> list[str]:
+        """Return the options of others that nothing reads. Collective."""
+        self.set_up()
+        return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
