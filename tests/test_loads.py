@@ -9,6 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from solid_cases import body, field, gathered, step, wave
 
+from petfsi.bench.case import only_options
 from petfsi.errors import InputError
 from petfsi.fields.solid import SimplexSolid
 from petfsi.fields.solid.elements import State
@@ -17,9 +18,10 @@ from petfsi.fields.solid.rules import shape_functions, shape_slopes
 from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.surfaces import boundary_facets
-from petfsi.integrators import Stage
+from petfsi.integrators import INTEGRATORS, Stage
 from petfsi.scene.load import scene_from_dict
 from petfsi.scene.schema import Box
+from petfsi.simulation import Simulation
 
 COMM = MPI.COMM_WORLD
 SIZE = np.array([1.5, 1.0, 0.8])
@@ -282,7 +284,7 @@ WAY = {"x": "0.05*sin(4*t + y)", "y": "0.02*t*x"}
 
 
 @pytest.mark.parallel([1, 2])
-@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+@pytest.mark.parametrize("integrator", sorted(INTEGRATORS))
 def test_a_prescribed_displacement_is_met_at_the_end_of_every_step(integrator, dim):
     push = [{"where": "right", "fix": ["x", "y"], "displacement": WAY}, {"where": "left", "fix": ["x"]}]
     solid = field(dim, COMM, integrator=integrator, b=body(dim, supports=push))
@@ -452,9 +454,13 @@ def inflate(path, n, pressure, elements="linear"):
     load = {"where": {"tag": "inner"}, "pressure": pressure}
     solid = SimplexSolid(COMM, scene_from_dict(ring(path, material="neohookean", elements=elements, loads=[load])))
     norms = newton(solid)
+    return inner_stretch(solid), norms
+
+
+def inner_stretch(solid):
     X, d = gathered(solid, "points"), gathered(solid, "displacement")
     inner = np.isclose(np.linalg.norm(X, axis=1), 1.0)
-    return np.linalg.norm(X + d, axis=1)[inner].mean(), norms
+    return np.linalg.norm(X + d, axis=1)[inner].mean()
 
 
 @pytest.mark.parallel([1, 2])
@@ -469,3 +475,43 @@ def test_a_thick_cylinder_inflates_as_derived_and_newton_converges_quadratically
         late = norms[(norms < 1e-2) & (norms > 1e-7)]
         assert len(norms) <= 12 and np.all(norms[np.flatnonzero(np.isin(norms, late)) + 1] < 100 * late**1.8), norms
     assert errors[1] < 0.005 * stretch
+
+
+@pytest.mark.parallel([1, 2])
+def test_load_steps_of_the_program_end_in_the_same_equilibrium(shared_path):
+    pressure, path = 0.1226763839, shared_path / "ring.msh"
+    wanted, _ = inflate(path, 2, pressure)
+    load = {"where": {"tag": "inner"}, "pressure": f"{pressure}*t"}
+    data = ring(path, material="neohookean", loads=[load])
+    data["time"] = {"end": 1.0, "dt": 0.25, "integrator": "static"}
+    with only_options(["-options_file", "monolithic-direct.opts", "-fsi_snes_rtol", "1e-12"]):
+        sim = Simulation(COMM, scene_from_dict(data))
+        sim.prepare()
+        for _ in range(4):
+            sim.advance()
+    assert inner_stretch(sim.fields[0]) == pytest.approx(wanted, rel=1e-10)
+
+
+@pytest.mark.parametrize("integrator, most, falls", [("newmark", 1e-3, 3), ("bdf2", 1e-5, 10), ("midpoint", 1e-6, 0)])
+def test_an_inflated_ring_swings_alike_with_newton_and_with_one_solve_a_step(shared_path, integrator, most, falls):
+    """What one linearisation leaves out, of the follower too, is less than the scheme's own error.
+
+    It falls with the step faster, as h^2 of newmark and h^4 of bdf2; of midpoint it is below 1e-6 at once.
+    """
+    path, load = shared_path / "ring.msh", {"where": {"tag": "inner"}, "pressure": "0.08*sin(2*t)"}
+    annulus(path, 1, 8)
+
+    def final(options, dt):
+        data = ring(path, material="neohookean", loads=[load])
+        data["time"] = {"end": 1.6, "dt": dt, "integrator": integrator}
+        with only_options(["-options_file", "monolithic-direct.opts", *options]):
+            sim = Simulation(COMM, scene_from_dict(data))
+            sim.prepare()
+            for _ in range(round(1.6 / dt)):
+                sim.advance()
+        return inner_stretch(sim.fields[0]) - 1
+
+    newton_options = ["-fsi_snes_type", "newtonls", "-fsi_snes_rtol", "1e-11"]
+    gaps = [abs(final([], dt) - final(newton_options, dt)) for dt in (0.1, 0.05)]
+    assert final([], 0.05) > 0.2
+    assert gaps[1] < most and gaps[0] > falls * gaps[1], gaps
