@@ -171,7 +171,7 @@ class Simulation:
         for coupling in self.couplings:
             coupling.assemble(t, dt)
         if self.system.is_outdated():  # unknowns came or went
-            self.system = System(self.comm, self.fields, self.couplings)
+            self.system = System(self.comm, self.fields, self.couplings, before=self.system)
             self.solver.adopt(self.system)
             if self.regions:
                 self.regions.adopt(self.system)

@@ -17,6 +17,7 @@ from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import FluidField
 from petfsi.multigrid import Hierarchy
 from petfsi.newton import Newton, Restage, as_it_is, snes_type
+from petfsi.option_stories import option_story, petsc_text
 from petfsi.pressure_solver import PressureSolver
 from petfsi.system import System
 
@@ -189,7 +190,7 @@ class Solver:
                 fluid = self._pressure.fluid
                 self._pressure.settle(self._sub_solvers(self._ksp)[-1], self._grids(fluid))
         except PETSc.Error as error:
-            raise InputError(_option_story(self.prefix, error)) from None
+            raise InputError(option_story(self.prefix, error)) from None
 
     def _create(self) -> PETSc.KSP:
         system = self.system
@@ -305,7 +306,7 @@ class Solver:
         try:
             ksp.solve(b, x)
         except PETSc.Error as error:
-            raise SolveError(f"solver '{self.prefix}' broke down: {_petsc_text(error)}") from None
+            raise SolveError(f"solver '{self.prefix}' broke down: {petsc_text(error)}") from None
         norms = self.system.update_residual(x, b)
         self._judge(ksp, norms)
         return max(self._inner_iterations, ksp.getIterationNumber()), norms
@@ -352,7 +353,7 @@ class Solver:
         try:
             self._ksp.getPC().apply(self.system.rhs, self.system.residual)
         except PETSc.Error as error:
-            raise InputError(_option_story(self.prefix, error)) from None
+            raise InputError(option_story(self.prefix, error)) from None
         unread = petsc.unread_options(PREFIX)
         if not self.system.index_sets:  # options of the others wait for a scene that couples
             others = f"{PREFIX}fieldsplit_" if self.prefix == PREFIX else "-"
@@ -388,28 +389,3 @@ COMMON = (
     "snes_type snes_rtol snes_atol snes_stol snes_max_it snes_monitor snes_linesearch_type snes_converged_reason "
     "pc_fieldsplit_schur_fact_type pc_fieldsplit_schur_precondition pc_factor_mat_solver_type"
 ).split()
-
-
-def _petsc_text(error: PETSc.Error) -> str:
-    """Return the last words of a PETSc error: what it said, without where in PETSc."""
-    lines = [line.split("]", 1)[-1].strip() for line in str(error).splitlines()]
-    return next((line for line in reversed(lines) if line and "()" not in line), f"error code {error.ierr}")
-
-
-def _option_story(prefix: str, error: PETSc.Error) -> str:
-    text = _petsc_text(error).rstrip(".")
-    option = " or ".join(_options_meant(text, prefix)) or f"-{prefix}..."
-    hint = "; all of the matrix can be factorised with -fsi_mat_type aij" if "matrix type nest" in text else ""
-    return f"option {option}: PETSc cannot set this solver up: {text}{hint} (code {error.ierr})"
-
-
-def _options_meant(text: str, prefix: str) -> list[str]:
-    """Return the options that a PETSc message speaks of; most name the value only."""
-    words = {word.rstrip(".,") for word in text.split()}
-    values = PETSc.Options().getAll()
-    options = {f"-{name}": value for name, value in sorted(values.items()) if name.startswith(prefix)}
-    kind = next((f"_{kind.lower()}_type" for kind in ("KSP", "PC") if f"{kind} type" in text), "")
-    named = [name for name in options if name in words]
-    return [f"{name} {options[name]}" for name in named] or [
-        f"{name} {value}" for name, value in options.items() if value in words and name.endswith(kind)
-    ]

@@ -22,6 +22,14 @@ class System:
     where r and c are the fields' row and column scales: all residuals and unknowns are then comparable numbers
     (m/s where there is a fluid). A single field needs no nest; its block is the operator.
 
+    Parameters
+    ----------
+    comm : MPI.Comm
+    fields : sequence of Field
+    couplings : sequence of Coupling
+    before : System, optional
+        That of the same fields and couplings in whose place this one steps.
+
     Attributes
     ----------
     operator : PETSc.Mat
@@ -32,7 +40,9 @@ class System:
         The unknowns of each field; empty for a single field.
     """
 
-    def __init__(self, comm: MPI.Comm, fields: Sequence[Field], couplings: Sequence[Coupling]) -> None:
+    def __init__(
+        self, comm: MPI.Comm, fields: Sequence[Field], couplings: Sequence[Coupling], before: System | None = None
+    ) -> None:
         self.comm = comm
         self.fields = list(fields)
         self.couplings = list(couplings)
@@ -54,7 +64,8 @@ class System:
         self.residual = self.rhs.duplicate()
         offsets = np.cumsum([0] + [field.layout.n_local for field in self.fields])
         self._pieces = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-        self._seen: dict[object, int] = {}
+        # a block that stays was scaled already, unless it has been assembled since
+        self._seen: dict[object, int] = {} if before is None else dict(before._seen)
         self._held = self._blocks()
 
     @property

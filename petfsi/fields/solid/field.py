@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Protocol
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.lumped import LumpedEquation
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
@@ -25,62 +26,6 @@ from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Number, Scene, Solid
 from petfsi.scene.stepping import Stepping
-
-
-class ElementLibrary(Protocol):
-    """What a solid's elements offer; arrays are over all local nodes, shape (n, width), but for ``b`` (owned ones)."""
-
-    @property
-    def constant(self) -> bool:
-        """Whether K' never changes."""
-        ...
-
-    def assemble(self, at: State, a: float, k: float, pattern: Pattern, values: np.ndarray, b: np.ndarray) -> None:
-        """Fill A's values and b with  (a + a0) M + (k + a1) K'(d)  and  M V - K'(d) s - K(d). Not collective."""
-        ...
-
-    def forces(self, at: State, b: np.ndarray) -> None:
-        """Fill b alone, without a matrix. Not collective."""
-        ...
-
-    def lumped_mass(self, n: int) -> np.ndarray:
-        """Return the diagonal of the lumped mass at the first ``n`` nodes, shape (n, width), kg."""
-        ...
-
-    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
-        """Return no less than the largest eigenvalue of M^-1 K'(d), M diagonal, of these elements, 1/s^2."""
-        ...
-
-    def uniform_load(self, n: int) -> np.ndarray:
-        """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, width), kg."""
-        ...
-
-    def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
-        """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
-        ...
-
-    def powers(
-        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
-    ) -> tuple[float, float]:
-        """Return what damping takes and what g does against the step's forces, W. Not collective."""
-        ...
-
-
-class LoadLibrary(Protocol):
-    """What a solid's loads offer; arrays as of ``ElementLibrary``."""
-
-    @property
-    def follow(self) -> bool:
-        """Whether any of them depends on the displacement."""
-        ...
-
-    def assemble(self, time: float, at: State, k: float, values: np.ndarray | None, b: np.ndarray) -> None:
-        """Add  f(d~) + f' s  to b and  -k f'  to A's values, where forces depend on d. Collective."""
-        ...
-
-    def felt(self, w: np.ndarray) -> np.ndarray:
-        """Return the forces of the step last assembled for its solution, at the owned nodes, N. Not collective."""
-        ...
 
 
 class NodalSolid(SolidField):
@@ -142,12 +87,12 @@ class NodalSolid(SolidField):
 
         self._tags = on_root(comm, lambda: _tags(scene, solids, mesh))
         self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
-        self._set_exchange(mesh)
         self._damping = np.array([[solid.damping.mass, solid.damping.stiffness] for solid in solids.values()])
         self._lumped = self._lump() if self.explicit else None
         self._set_pattern()
         self._loads = self._make_loads(mesh, solids)
         self.is_linear = self._elements.constant and not (self._loads is not None and self._loads.follow)
+        self._set_exchange(mesh)
         self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
 
     @abstractmethod
@@ -188,6 +133,10 @@ class NodalSolid(SolidField):
         here = here[placed]
         self.displacement.reshape(-1)[held[placed][here] - self.layout.start] = self._supports.displacements(0.0)[here]
 
+    @cached_property
+    def _pattern(self) -> Pattern:
+        return Pattern.of(self._mesh, self.width)
+
     def _lump(self) -> LumpedEquation:
         damping = self._damping[self._node_body[self._mesh.natural[: self._mesh.n_owned]]]
         mass = self._elements.lumped_mass(self._mesh.n_owned)
@@ -198,7 +147,7 @@ class NodalSolid(SolidField):
         self.block = new_block(self.comm, self.layout, self.layout, block_size=self.width)
         rows: Pattern | LumpedEquation
         if self._lumped is None:
-            rows = self._pattern = Pattern.of(self._mesh, self.width)
+            rows = self._pattern
             self._elimination = Elimination(self._pattern, self.layout, self._supports.unknowns)
         else:
             rows = self._lumped
@@ -211,7 +160,7 @@ class NodalSolid(SolidField):
             vectors.append(vector)
         self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
         self._diagonal = (0.0, 0.0), 1.0
-        self._assembled_for = 0.0, 0.0
+        self._assembled_for = 0.0, 0.0, 0.0, 0.0  # a, k, dt and the mass in row_scale
 
     def _set_exchange(self, mesh: SimplexMesh) -> None:
         """Prepare the messages between owned, shared and naturally ordered nodes."""
@@ -234,23 +183,32 @@ class NodalSolid(SolidField):
         self._geometry = self._stage.tangent_at
 
     def assemble(self, time: float, dt: float) -> None:
-        """Refresh A and b for the step from ``time`` to ``time + dt``. Collective."""
+        """Refresh A (only if it changes) and b for the step from ``time`` to ``time + dt``. Collective."""
         if self._lumped is not None:
             self._assemble_lumped(self._lumped, time, dt)
             return
         stage = self._stage or self._integrator.stage(self._motion(), dt)
         b = self.rhs.reshape(-1, self.width)
-        diagonal = self._mean_diagonal(stage)
         local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
         state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
-        self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
+        made_for = stage.a, stage.k, dt, self._reference_mass
+        values = None if self.is_linear and made_for == self._assembled_for else self._values
+        if values is None:  # A is still the same
+            self._elements.forces(state, b)
+        else:
+            diagonal = self._mean_diagonal(stage)
+            self._elements.assemble(state, stage.a, stage.k, self._pattern, values, b)
         self._loaded = stage, state, self._add_weight(time, dt)
-        self._add_loads(time, dt, stage, state)
+        if self._loads is not None:
+            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, values, b)
         self._prescribe(stage, time, dt)
-        self._elimination.apply(self._values, self.rhs, self._prescribed, diagonal)
-        set_csr(self.block, self._pattern.indptr, self._pattern.indices, self._values, new_pattern=False)
+        if values is not None:
+            self._elimination.empty(values, diagonal)
+            set_csr(self.block, self._pattern.indptr, self._pattern.indices, values, new_pattern=False)
+            self._assembled_for = made_for
+            self.n_assembled += 1
+        self._elimination.prescribe(self.rhs, self._prescribed)
         self.row_scale = dt / self._reference_mass
-        self.n_assembled += 1
 
     def _assemble_lumped(self, lumped: LumpedEquation, time: float, dt: float) -> None:
         """Refresh the diagonal A only if the step's length has changed, and b. Collective."""
@@ -267,13 +225,14 @@ class NodalSolid(SolidField):
         self._elements.forces(state, b)
         b += lumped.mass * stage.inertia
         self._loaded = stage, state, self._add_weight(time, dt)
-        self._add_loads(time, dt, stage, state)
+        if self._loads is not None:
+            self._loads.assemble(time + self._integrator.moment(dt), state, 0.0, None, b)
         if self._loses:
             self._pull = b.copy()
         self._prescribe(stage, time, dt)
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
-        if self._assembled_for != (stage.a, mean):
-            self._assembled_for = stage.a, mean
+        if self._assembled_for != (stage.a, 0.0, dt, mean):
+            self._assembled_for = stage.a, 0.0, dt, mean
             set_csr(self.block, lumped.indptr, lumped.indices, lumped.diagonal(stage.a, mean), new_pattern=False)
             self.n_assembled += 1
         self.row_scale = dt / mean
@@ -286,12 +245,6 @@ class NodalSolid(SolidField):
             if gravity[axis]:
                 b += gravity[axis] * self._uniform[axis]
         return gravity
-
-    def _add_loads(self, time: float, dt: float, stage: Stage, state: State) -> None:
-        if self._loads is not None:
-            values = None if self.explicit else self._values
-            b = self.rhs.reshape(-1, self.width)
-            self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, values, b)
 
     def linearised_at(self) -> np.ndarray:
         """Return the w with  D0 + k w = d~."""

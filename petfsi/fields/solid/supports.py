@@ -188,10 +188,14 @@ class Elimination:
         diagonal = self._empty[pattern.indices[self._empty] == row[self._empty] + unknowns.start]
         self._diagonal = diagonal
 
-    def apply(self, values: np.ndarray, b: np.ndarray, g: np.ndarray, diagonal: float) -> None:
-        """Change A's values and b (flat) in place. Not collective."""
-        lift = values[self._lifted] * g[self._lifted_column]
-        b -= np.bincount(self._lifted_row, weights=lift, minlength=len(b))
+    def empty(self, values: np.ndarray, diagonal: float) -> None:
+        """Change A's values in place, and keep A[:, F] for ``prescribe``. Not collective."""
+        self._taken, self._on_diagonal = values[self._lifted], diagonal
         values[self._empty] = 0.0
         values[self._diagonal] = diagonal
-        b[self._rows] = diagonal * g[self._own]
+
+    def prescribe(self, b: np.ndarray, g: np.ndarray) -> None:
+        """Change b (flat) in place, for the A that was emptied last. Not collective."""
+        lift = self._taken * g[self._lifted_column]
+        b -= np.bincount(self._lifted_row, weights=lift, minlength=len(b))
+        b[self._rows] = self._on_diagonal * g[self._own]

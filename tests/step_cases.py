@@ -1,0 +1,55 @@
+"""What the tests of whole steps share: small scenes in this process, each with its own PETSc options."""
+
+from contextlib import contextmanager
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.bench.case import only_options
+from petfsi.scene.load import load_scene
+from petfsi.scene.schema import Scene
+from petfsi.simulation import Simulation
+
+LEFT = [{"where": "left", "fix": ["x", "y"]}]
+
+
+def block(cells=(1, 1), size=(1.0, 1.0), time=None, gravity=None, **solid):
+    """Return a scene of one block, clamped at its left side; ``accounts`` are kept."""
+    body = {
+        "shape": {"box": {"origin": [0.0, 0.0], "size": list(size), "cells": list(cells)}},
+        "density": 1.3, "young": 20.0, "poisson": 0.3, "material": "neohookean", "supports": LEFT,
+    }  # fmt: skip
+    return Scene.model_validate(
+        {
+            "dim": 2,
+            "time": {"end": 1.0, "dt": 0.1} | (time or {}),
+            "gravity": gravity,
+            "solids": {"block": body | solid},
+        }
+    )
+
+
+@contextmanager
+def prepared(scene, *options, comm=MPI.COMM_WORLD):
+    with only_options(list(options)):
+        sim = Simulation(comm, scene)
+        sim.prepare()
+        yield sim
+
+
+def stepped(scene, n, *options, comm=MPI.COMM_WORLD):
+    """Return a simulation after n steps."""
+    with prepared(scene, *options, comm=comm) as sim:
+        for _ in range(n):
+            sim.advance()
+    return sim
+
+
+def loaded(path, *sets):
+    return load_scene(path, list(sets))
+
+
+def motion(sim):
+    """Return displacements and velocities of all nodes in natural order, the same on every rank."""
+    parts = sim.comm.allgather([sim.solid.state()[name].data for name in ("displacement", "velocity")])
+    return np.concatenate([np.concatenate([part[n] for part in parts]) for n in range(2)])
