@@ -30,10 +30,6 @@ class ElementLibrary(Protocol):
         """Return the diagonal of the lumped mass at the first ``n`` nodes, shape (n, width), kg."""
         ...
 
-    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
-        """Return no less than the largest eigenvalue of M^-1 K'(d), M diagonal, of these elements, 1/s^2."""
-        ...
-
     def uniform_load(self, n: int) -> np.ndarray:
         """Return M e for a unit acceleration e along each axis, at the first ``n`` nodes, shape (dim, n, width), kg."""
         ...
