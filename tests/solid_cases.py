@@ -118,13 +118,13 @@ def whole_mesh(mesh):
     return distribute(MPI.COMM_SELF, mesh)[0]
 
 
-def simplices(points, cells, order="linear", volumetric="full"):
-    """Return the mesh of one body; patches are those of a box, if its simplices are whole cells of a grid."""
+def simplices(points, cells, order="linear", volumetric="full", patches=None):
+    """Return the mesh of one body; patches are the cells of a box mesh unless a function says otherwise."""
     dim, patch = points.shape[1], None
     if order == "quadratic":
         points, cells = with_middles(points, cells)
     elif volumetric == "reduced":
-        patch = grid_patches(cells, dim)
+        patch = (patches or grid_patches)(cells, dim)
     return whole_mesh(grouped_mesh([(points, cells, patch)]))
 
 

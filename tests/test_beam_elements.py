@@ -160,7 +160,8 @@ def test_interpolation_finds_what_nodes_say(theory):
     d = np.column_stack((np.outer(s**2, slope), 2 * s))  # a parabola across the axis
     for e, xi in ((0, -0.4), (1, 0.7), (1, 1.0)):
         x = 0.5 * e + 0.25 * (1 + xi)
-        value = elements.theory.interpolation(e, xi) @ d[elements.cells[e]].ravel()
+        (at,) = elements.theory.interpolation(np.array([e]), np.array([xi]))
+        value = at @ d[elements.cells[e]].ravel()
         np.testing.assert_allclose(value, [*(x**2 * slope), 2 * x], atol=1e-14)
 
 

@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from solid_cases import body, field, gathered, pattern_of, step, wave
+from solid_cases import body, field, gathered, step, wave
 
 from petfsi.errors import InputError
 from petfsi.fields.solid import SimplexSolid
 from petfsi.fields.solid.elements import State
-from petfsi.fields.solid.loads import Body, Loads
-from petfsi.fields.solid.loads.rules import EDGES, shape_functions, simplex_rule, with_middles
-from petfsi.fields.solid.partition import LocalMesh
+from petfsi.fields.solid.loads.rules import simplex_rule
+from petfsi.fields.solid.rules import shape_functions, shape_slopes
 from petfsi.geometry.meshes import box_mesh
+from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.integrators import Stage
-from petfsi.petsc import Layout
 from petfsi.scene.load import scene_from_dict
-from petfsi.scene.schema import Box, Solid
+from petfsi.scene.schema import Box
 
 COMM = MPI.COMM_WORLD
 SIZE = np.array([1.5, 1.0, 0.8])
+ORDERS = pytest.mark.parametrize("elements", ["linear", "quadratic"])
 
 
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])
@@ -68,10 +68,9 @@ def test_a_rule_is_exact_to_its_degree(simplex):
 def test_quadratic_shape_functions_are_one_at_their_node_and_reproduce_squares(simplex):
     corners = np.eye(simplex + 1)
     nodes = np.concatenate((corners, corners[EDGES[simplex]].mean(axis=1)))
-    values, slopes = shape_functions(nodes, len(nodes))
-    np.testing.assert_allclose(values, np.eye(len(nodes)), atol=1e-15)
+    np.testing.assert_allclose(shape_functions(nodes, len(nodes)), np.eye(len(nodes)), atol=1e-15)
     x, _ = simplex_rule(simplex, 2)
-    values, slopes = shape_functions(x, len(nodes))
+    values, slopes = shape_functions(x, len(nodes)), shape_slopes(x, len(nodes))
     np.testing.assert_allclose(values @ nodes[:, 1] ** 2, x[:, 1] ** 2, atol=1e-14)
     np.testing.assert_allclose(np.einsum("qak,a->qk", slopes, nodes[:, 1] ** 2)[:, 0], 2 * x[:, 1], atol=1e-14)
 
@@ -110,9 +109,10 @@ def test_a_body_force_fills_the_volume(dim):
 
 
 @pytest.mark.parallel([1, 2, 3])
+@ORDERS
 @pytest.mark.parametrize("at", [(0.61, 0.37, 0.22), (1.5, 1.0, 0.8)])
-def test_a_point_force_acts_at_its_point(dim, at):
-    solid = loaded(dim, loads=[{"at": list(at[:dim]), "force": ["1 + t*x", -2.0, 3.0][:dim]}])
+def test_a_point_force_acts_at_its_point(dim, at, elements):
+    solid = loaded(dim, elements=elements, loads=[{"at": list(at[:dim]), "force": ["1 + t*x", -2.0, 3.0][:dim]}])
     got = resultant(solid, time=2.0)
     f = np.array([1 + 2 * at[0], -2.0, 3.0])
     np.testing.assert_allclose(got[:dim], f[:dim], rtol=1e-12)
@@ -178,8 +178,9 @@ def enclosed_volume(x, facets):
 
 
 @pytest.mark.parallel([1, 2])
-def test_a_uniform_pressure_on_a_closed_surface_has_no_resultant(dim):
-    solid = loaded(dim, loads=[{"where": "all", "pressure": 7.0}])
+@ORDERS
+def test_a_uniform_pressure_on_a_closed_surface_has_no_resultant(dim, elements):
+    solid = loaded(dim, elements=elements, loads=[{"where": "all", "pressure": 7.0}])
 
     def move(x):
         return 0.1 * np.sin(3 * x + x[:, ::-1])
@@ -203,8 +204,9 @@ def test_a_uniform_pressure_works_on_the_volume(dim):
 
 
 @pytest.mark.parallel([1, 2])
-def test_the_tangent_of_a_pressure_on_a_closed_surface_is_that_of_its_forces(dim):
-    solid = loaded(dim, loads=[{"where": "all", "pressure": 7.0}])
+@ORDERS
+def test_the_tangent_of_a_pressure_on_a_closed_surface_is_that_of_its_forces(dim, elements):
+    solid = loaded(dim, elements=elements, loads=[{"where": "all", "pressure": 7.0}])
 
     def move(x):
         return 0.1 * np.sin(3 * x + x[:, ::-1])
@@ -242,58 +244,36 @@ def test_the_pressure_leaves_the_matrix_symmetric(dim):
 # ---- quadratic elements -------------------------------------------------------------------------------------
 
 
-def quadratic(dim, **tables):
-    """Return loads on one body of quadratic elements, straight at rest, and its nodes and boundary facets."""
-    points, cells = box_mesh(Box(origin=[0] * dim, size=SIZE[:dim].tolist(), cells=[2] * dim))
-    ends = np.sort(cells[:, EDGES[dim]].reshape(-1, 2), axis=1)
-    edges, which = np.unique(ends, axis=0, return_inverse=True)
-    elements = np.concatenate((cells, len(points) + which.reshape(len(cells), -1)), axis=1).astype(np.int32)
-    nodes = np.concatenate((points, points[edges].mean(axis=1)))
-    n, all_nodes = len(nodes), np.arange(len(nodes))
-    mesh = LocalMesh(nodes, elements, np.zeros(len(cells), np.int32), np.arange(len(cells)), np.ones(len(cells), bool),
-                     all_nodes.astype(np.int32), all_nodes, Layout(n, 0, n))  # fmt: skip
-    solid = Solid.model_validate(body(dim, **tables))
-    pattern = pattern_of(nodes, elements)
-    loads = Loads(MPI.COMM_SELF, {"b": solid}, {"b": Body(all_nodes, nodes, elements, elements, {})}, mesh, pattern, {})
-    facets = with_middles(boundary_facets(points, cells), elements)
-    return loads, nodes, facets
-
-
 def test_facets_of_quadratic_elements_have_their_middles(dim):
-    _, nodes, facets = quadratic(dim)
-    middles = nodes[facets[:, :dim]][:, EDGES[dim - 1]].mean(axis=2)
-    np.testing.assert_allclose(nodes[facets[:, dim:]], middles, atol=1e-15)
+    solid = loaded(dim, MPI.COMM_SELF, elements="quadratic")
+    x, elements = solid._mesh.points, solid._mesh.elements(0)
+    facets = facets_with_middles(boundary_facets(x, elements[:, : dim + 1]), elements)
+    assert facets.shape[1] == {2: 3, 3: 6}[dim]
+    np.testing.assert_allclose(x[facets[:, dim:]], x[facets[:, :dim]][:, EDGES[dim - 1]].mean(axis=2), atol=1e-15)
 
 
+@pytest.mark.parallel([1, 3])
 def test_loads_on_quadratic_elements_have_their_resultants(dim):
-    loads, x, _ = quadratic(
+    solid = loaded(
         dim,
+        elements="quadratic",
         loads=[{"where": "right", "traction": ["y*y", 1.0, 0.0][:dim]}, {"where": "top", "pressure": "x*x"}],
         body_force=["x*y*y", 0.0, 0.0][:dim],
     )
-    b, zero = np.zeros_like(x), np.zeros_like(x)
-    loads.assemble(0.0, State(zero, zero, zero), 0.0, None, b)
     lz = 1.0 if dim == 2 else 0.8
+    got = resultant(solid)
     wanted = [1 / 3 + 1.5**2 / 2 / 3, 1.0 - 1.5**3 / 3, 0.0][:dim]
-    np.testing.assert_allclose(b.sum(axis=0), np.array(wanted) * lz, atol=1e-12)
-    moment = 1.5 - 1.5**4 / 4 - 1 / 4 - 1.5**2 / 2 / 4
-    np.testing.assert_allclose(x[:, 0] @ b[:, 1] - x[:, 1] @ b[:, 0], moment * lz, rtol=1e-12)
+    np.testing.assert_allclose(got[:dim], np.array(wanted) * lz, atol=1e-12)
+    np.testing.assert_allclose(got[dim] / lz, 1.5 - 1.5**4 / 4 - 1 / 4 - 1.5**2 / 2 / 4, rtol=1e-12)
 
 
-def test_a_pressure_on_curved_quadratic_facets_has_no_resultant_and_its_exact_tangent(dim):
-    loads, x, _ = quadratic(dim, loads=[{"where": "all", "pressure": 7.0}])
-    zero, d, v, e = np.zeros_like(x), wave(len(x), dim), wave(len(x), dim, seed=8, size=1.0), 1e-5
-
-    def at(d, k=0.0, shift=zero):
-        b = np.zeros_like(x)
-        loads.assemble(0.0, State(d, zero, shift), k, None, b)
-        return b
-
-    f = at(d)
-    np.testing.assert_allclose(f.sum(axis=0), 0.0, atol=1e-13)
-    np.testing.assert_allclose((x + d).T @ f - f.T @ (x + d), 0.0, atol=1e-12)
-    slope = (at(d + e * v) - at(d - e * v)) / (2 * e)
-    np.testing.assert_allclose(at(d, k=1.0, shift=v) - f, slope, atol=1e-8)
+def test_a_uniform_traction_loads_the_middles_of_quadratic_facets(dim):
+    """By Simpson's rule 1, 4, 1 sixths of a segment; of a triangle a third each and nothing at the corners."""
+    solid = loaded(dim, MPI.COMM_SELF, elements="quadratic", loads=[{"where": "right", "traction": [6.0, 0, 0][:dim]}])
+    f, x = forces(solid)[:, 0], solid.reference
+    corner = np.isin(np.arange(len(x)), solid._mesh.elements(0)[:, : dim + 1])
+    assert f[~corner].sum() == pytest.approx(4.0 if dim == 2 else 4.8, rel=1e-12)
+    assert f.sum() == pytest.approx(6.0 if dim == 2 else 4.8, rel=1e-12)
 
 
 # ---- prescribed displacements -------------------------------------------------------------------------------
@@ -365,7 +345,7 @@ def test_an_unknown_follows_the_prescribed_displacement_at_second_order():
 # ---- tags ---------------------------------------------------------------------------------------------------
 
 
-def annulus(path, n_along, n_around, quarter=True):
+def annulus(path, n_along, n_around):
     """Write a quarter of a ring, radii 1 to 1.2, with its inner arc and both cuts tagged."""
     box = Box(origin=[0, 0], size=[1, 1], cells=[n_along, n_around])
     s, cells = box_mesh(box)
@@ -401,12 +381,13 @@ def shared_path(tmp_path):
 
 
 @pytest.mark.parallel([1, 3])
-def test_tags_of_a_mesh_file_pick_facets_and_nodes(shared_path):
+@ORDERS
+def test_tags_of_a_mesh_file_pick_facets_and_nodes(shared_path, elements):
     annulus(shared_path / "ring.msh", 2, 8)
     load = {"where": {"tag": "inner"}, "pressure": 2.0}
-    solid = SimplexSolid(COMM, scene_from_dict(ring(shared_path / "ring.msh", loads=[load])))
+    solid = SimplexSolid(COMM, scene_from_dict(ring(shared_path / "ring.msh", elements=elements, loads=[load])))
     np.testing.assert_allclose(resultant(solid)[:2], [2.0, 2.0], rtol=1e-12)
-    assert len(solid._supports.unknowns) == 6
+    assert len(solid._supports.unknowns) == {"linear": 6, "quadratic": 10}[elements]
 
 
 @pytest.mark.parallel([1, 2])
@@ -465,11 +446,11 @@ def newton(solid, most=25, tolerance=1e-12):
     return norms
 
 
-def inflate(path, n, pressure):
-    """Return the stretch of the inner radius and the residuals of the last load step's Newton iterations."""
+def inflate(path, n, pressure, elements="linear"):
+    """Return the stretch of the inner radius and the residuals of Newton's iterations."""
     annulus(path, n, 8 * n)
     load = {"where": {"tag": "inner"}, "pressure": pressure}
-    solid = SimplexSolid(COMM, scene_from_dict(ring(path, material="neohookean", loads=[load])))
+    solid = SimplexSolid(COMM, scene_from_dict(ring(path, material="neohookean", elements=elements, loads=[load])))
     norms = newton(solid)
     X, d = gathered(solid, "points"), gathered(solid, "displacement")
     inner = np.isclose(np.linalg.norm(X, axis=1), 1.0)

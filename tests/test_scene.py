@@ -181,7 +181,7 @@ BROKEN = [
     (["solids.layer.tangent=soft"], 'tangent = "soft"', "must be 'exact' or 'projected' (projected: without"),
     (["solids.layer.interior=air"], 'interior = "air"', "must be 'fluid' or 'void'"),
     (["solids.layer.supports.0.fix=[]"], "solids.layer.supports.0.fix = []", "must not be empty"),
-    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "'x', 'y', 'z' or 'angle'"),
+    (["solids.layer.supports.1.fix=['w']"], "solids.layer.supports.1.fix.0", "must be 'x', 'y', 'z' or 'angle'"),
     (
         ["solids.layer.supports.0.velocity={w = 1.0}"],
         "solids.layer.supports.0.velocity.w",
@@ -382,7 +382,7 @@ BROKEN = [
     (
         [load("where = 'under', pressure = 1.0")],
         'loads.0.where = "under"',
-        "'all', 'start' or 'end' (or a shape such as",
+        "'front', 'all', 'start' or 'end' (or a shape such as",
     ),
     ([load("where = { tag = 'lid' }, pressure = 1.0")], 'loads.0.where.tag = "lid"', "a tag is a mesh file's"),
     ([load("where = { mesh = 'a.stl' }, pressure = 1.0")], "loads.0.where.mesh", "must be a box, ball, cylinder or"),

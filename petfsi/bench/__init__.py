@@ -30,6 +30,7 @@ BENCHES = {
     "splitting": Bench("growth per step of the split scheme, against linear theory", "30 s", "10 s"),
     "stability": Bench("which schemes, steps and dampings keep the bar in a jet bounded", "90 min", "4 min"),
     "phases": Bench("seconds per phase and step, monolithic against split, on the bar", "40 s", "10 s"),
+    "solids": Bench("solids and beams alone: error against seconds by element and integrator", "10 min", "40 s"),
     "solid-speed": Bench(
         "a solid's assembly against products with its matrix; its solve, eight times finer", "4 min", "5 s"
     ),

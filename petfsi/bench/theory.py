@@ -68,6 +68,20 @@ def fit_damped_sinusoid(t: np.ndarray, y: np.ndarray, omega: float, damping: flo
     return float(omega), float(damping)
 
 
+def frequency(t: np.ndarray, y: np.ndarray) -> float:
+    """Return the frequency of an oscillation, Hz, from where it crosses the middle between its extremes.
+
+    Parameters
+    ----------
+    t, y : ndarray, shape (n,)
+        Two crossings at least.
+    """
+    off = y - (y.max() + y.min()) / 2
+    k = np.flatnonzero(off[:-1] * off[1:] < 0)
+    crossings = t[k] - off[k] * (t[k + 1] - t[k]) / (off[k + 1] - off[k])
+    return float((len(crossings) - 1) / 2 / (crossings[-1] - crossings[0]))
+
+
 def orders(errors: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
     """Return the observed order between each two neighbours."""
     return np.diff(np.log(np.abs(errors))) / np.diff(np.log(sizes))

@@ -84,6 +84,10 @@ class SimplexMesh:
     body: np.ndarray
     groups: tuple[Group, ...] = ()
 
+    def elements(self, body: int) -> np.ndarray:
+        """Return the nodes of a body's elements, those of its cells where there are no groups."""
+        return next((group.nodes for group in self.groups if group.body == body), self.cells[self.body == body])
+
     @classmethod
     def union(cls, meshes: list[tuple[np.ndarray, np.ndarray]]) -> SimplexMesh:
         """Return the disjoint union of (points, cells) pairs, body after body."""

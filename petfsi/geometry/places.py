@@ -8,6 +8,7 @@ import numpy as np
 
 from petfsi.errors import InputError
 from petfsi.geometry.meshes import CELL_TYPE, FACET_TYPE, open_mesh
+from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.scene.schema import Shape, Solid, Tagged
 
@@ -17,7 +18,7 @@ TOLERANCE = 1e-6
 
 _SIDES = {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1), "back": (2, 0), "front": (2, 1)}
 
-#: The facets of each tag, shape (n, dim), in the numbering of the body's own mesh.
+#: The facets of each tag in the numbering of the body's own mesh, corners first: shape (n, dim), or with middles too.
 Tags = dict[str, np.ndarray]
 
 
@@ -59,8 +60,13 @@ def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
     return {name: np.concatenate(facets) for name, facets in groups.items()}
 
 
+def with_middles(tags: Tags, elements: np.ndarray) -> Tags:
+    """Return the same facets with the middles of their edges, where the elements have some."""
+    return {name: facets_with_middles(facets, elements) for name, facets in tags.items()}
+
+
 def located(where: str | Shape | Tagged, points: np.ndarray, key: str, tags: Tags) -> np.ndarray:
-    """Return which reference points of one body lie in a place; of a tag those of its facets.
+    """Return which reference points of one body lie in a place; those of a beam are given from start to end.
 
     Parameters
     ----------
@@ -87,7 +93,7 @@ def located(where: str | Shape | Tagged, points: np.ndarray, key: str, tags: Tag
         held[_tagged(where, key, tags)] = True
     elif isinstance(where, Shape):
         held = inside(where, points)
-    elif where in ("start", "end"):  # of a beam, whose points are given in this order
+    elif where in ("start", "end"):
         held = np.arange(len(points)) == (0 if where == "start" else len(points) - 1)
     elif where == "all":
         held = np.ones(len(points), dtype=bool)
@@ -127,7 +133,8 @@ def located_facets(
         If there is none.
     """
     if isinstance(where, Tagged):
-        both = np.sort(np.concatenate((facets, _tagged(where, key, tags))), axis=1)
+        tagged = _tagged(where, key, tags)[:, : facets.shape[1]]
+        both = np.sort(np.concatenate((facets, tagged)), axis=1)
         _, group = np.unique(both, axis=0, return_inverse=True)
         chosen = np.isin(group.ravel()[: len(facets)], group.ravel()[len(facets) :])
     else:

@@ -64,3 +64,6 @@ def _settings(key: str, solid: Solid) -> Problems:
         if field is not None and getattr(solid, name) != field.default:
             allowed = "means nothing to a beam, which has a theory; leave it out"
             yield Problem(f"{key}.{name}", getattr(solid, name), allowed, (f"{key}.shape.beam",))
+    for name in ("loads", "body_force"):
+        if getattr(solid, name):
+            yield Problem(f"{key}.{name}", ABSENT, "a beam takes no loads in this version", (f"{key}.shape.beam",))

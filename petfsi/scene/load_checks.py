@@ -26,13 +26,13 @@ def solid_loads(key: str, solid: Solid, dim: int) -> Problems:
     yield from length(f"{key}.body_force", solid.body_force, dim)
     for n, load in enumerate(solid.loads):
         here = f"{key}.loads.{n}"
-        yield from _kind(here, load)
+        yield from _kind(here, load, solid)
         yield from place(f"{here}.where", load.where, f"{key}.shape", solid.shape, dim)
         for name in ("traction", "force", "at"):
             yield from length(f"{here}.{name}", getattr(load, name), dim)
 
 
-def _kind(key: str, load: Load) -> Problems:
+def _kind(key: str, load: Load, solid: Solid) -> Problems:
     """Yield what keeps a load from being exactly one of a traction, a pressure and a force."""
     kinds = load.kinds
     if len(kinds) != 1:
@@ -45,6 +45,8 @@ def _kind(key: str, load: Load) -> Problems:
         yield Problem(f"{key}.{other}", ABSENT, f"a {kinds[0]} has {wanted} instead", (f"{key}.{kinds[0]}",))
     elif getattr(load, wanted) is None:
         yield Problem(f"{key}.{wanted}", ABSENT, f"is missing; a {kinds[0]} needs it", (f"{key}.{kinds[0]}",))
-    if kinds == ["force"] and load.follower:
+    if load.moment is not None and solid.shape.beam is None:
+        yield Problem(f"{key}.moment", load.moment, "only a beam feels a moment", (f"{key}.at",))
+    if kinds == ["force"] and load.follower and solid.shape.beam is None:
         allowed = "a force at a point of this solid keeps its direction: there is nothing that it could turn with"
         yield Problem(f"{key}.follower", True, allowed, (f"{key}.force",))

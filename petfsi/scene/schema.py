@@ -245,7 +245,8 @@ def _where_form(value: Any) -> str:
     return "<table>" if isinstance(value, dict | Shape) else "<name>"
 
 
-#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, a shape or a mesh file's tag.
+#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, the start or end of a beam, a shape
+#: or a mesh file's tag.
 Where = Annotated[
     Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")] | Annotated[Tagged, Tag("<tag>")],
     Discriminator(_where_form),
@@ -277,11 +278,13 @@ class Load(Table):
     follower: Annotated[Flag | None, Field(description="whether it turns with the facets")] = None
     at: Annotated[Vector | None, Field(description="m, where the point is at rest")] = None
     force: Annotated[list[Number] | None, Field(description="N; may depend on x, y, z, t")] = None
+    moment: Annotated[Number | None, Field(description="N m, on a beam; may depend on x, y, t")] = None
 
     @property
     def kinds(self) -> list[str]:
-        """Which loads are given; a valid table names one."""
-        return [kind for kind in ("traction", "pressure", "force") if getattr(self, kind) is not None]
+        """Which loads are given; a valid table names one, a moment being a force or part of one."""
+        kinds = [kind for kind in ("traction", "pressure", "force") if getattr(self, kind) is not None]
+        return kinds if self.moment is None or "force" in kinds else [*kinds, "force"]
 
     @property
     def follows(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -12,6 +11,7 @@ from scipy.sparse import csr_matrix
 from petfsi.errors import InputError
 from petfsi.fields.base import Slab
 from petfsi.fields.beam.elements import THEORIES, WIDTH, BeamElements, Sections
+from petfsi.fields.beam.loads import AxisPlace, BeamLoads
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.partition import slab
 from petfsi.geometry.beams import (
@@ -31,22 +31,6 @@ from petfsi.scene.schema import Beam, Scene, Solid
 
 #: What a node's unknowns are called in the scene.
 COMPONENTS = ("x", "y", "angle")
-
-
-@dataclass(frozen=True)
-class AxisPlace:
-    """A point of an axis as a weighted sum of its element's nodes, the same on every rank.
-
-    Attributes
-    ----------
-    nodes : ndarray of int, shape (n_nodes,)
-        Global numbers.
-    weights : ndarray, shape (3, n_nodes, 3)
-        (u_x, u_y, theta) there from those of the nodes; transposed, the nodes' loads from a force and a moment.
-    """
-
-    nodes: np.ndarray
-    weights: np.ndarray
 
 
 class BeamSolid(NodalSolid):
@@ -88,6 +72,14 @@ class BeamSolid(NodalSolid):
     def _make_elements(self, solids: Mapping[str, Solid]) -> BeamElements:
         theory = next(iter(self._beams.values())).theory
         return BeamElements(self._mesh.points, self._mesh.cells, self._mesh.body, self._sections(solids), theory)
+
+    def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> BeamLoads | None:
+        if not any(solid.loads or solid.body_force for solid in solids.values()):
+            return None
+        axes = {name: axis_mesh(beam)[0] for name, beam in self._beams.items()}
+        first = dict(zip(self.names, self._first.tolist(), strict=False))
+        there = self._mesh, self._elements, self._pattern
+        return BeamLoads(self.comm, solids, *there, axes, first, self.place)
 
     def _sections(self, solids: Mapping[str, Solid]) -> Sections:
         def of(name: str) -> np.ndarray:
@@ -222,9 +214,10 @@ class BeamSolid(NodalSolid):
         length = whole / len(cells)
         e = min(int(s / length), len(cells) - 1)
         one = THEORIES[beam.theory](np.array([length]), t[None], np.zeros((1, 3)))
-        weights = one.interpolation(0, float(np.clip(2 * (s / length - e) - 1, -1.0, 1.0)))
+        xi = float(np.clip(2 * (s / length - e) - 1, -1.0, 1.0))
+        (weights,) = one.interpolation(np.array([0]), np.array([xi]))
         first = self._first[self.names.index(body)]
-        return AxisPlace(self._number[first + cells[e]], weights.reshape(WIDTH, -1, WIDTH))
+        return AxisPlace(self._number[first + cells[e]], weights, xi)
 
     def probe(self, body: str, at: tuple[float, ...] | list[float], quantity: str) -> np.ndarray:
         """Return ``displacement``, ``velocity`` or ``angle`` of the point of the axis next to ``at``. Collective."""
@@ -240,7 +233,8 @@ class BeamSolid(NodalSolid):
         local = place.nodes - self._mesh.nodes.start
         mine = (local >= 0) & (local < self._mesh.n_owned)
         value = np.empty(WIDTH)
-        self.comm.Allreduce(np.einsum("inj,nj->i", place.weights[:, mine], owned[local[mine]]), value)
+        weights = place.weights.reshape(WIDTH, -1, WIDTH)[:, mine]
+        self.comm.Allreduce(np.einsum("inj,nj->i", weights, owned[local[mine]]), value)
         return value[2:] if quantity == "angle" else value[:2]
 
     def output(self) -> dict[str, Slab]:

@@ -127,15 +127,15 @@ class BeamElements:
         A_M, A_K = a + self.sections.mass_damping[self.body], k + self.sections.stiffness_damping[self.body]
         A = A_M[:, None, None] * self.mass + A_K[:, None, None] * K
         values[:] = 0.0
-        _scatter_matrix(self.cells, A, pattern.node_ptr, pattern.slots[0], values)
-        self._gather(self._loads(at, f, K), b)
+        scatter_matrices(self.cells, A, pattern.node_ptr, pattern.slots[0], values)
+        self.gather(self._loads(at, f, K), b)
 
     def forces(self, at: State, b: np.ndarray) -> None:
         """Fill b alone, as ``assemble`` does. Not collective."""
         _, f, K = self.theory.respond(self._of_elements(at.displacement))
-        self._gather(self._loads(at, f, K), b)
+        self.gather(self._loads(at, f, K), b)
 
-    def _gather(self, loads: np.ndarray, b: np.ndarray) -> None:
+    def gather(self, loads: np.ndarray, b: np.ndarray) -> None:
         """Fill the first nodes' b with the sums of elements' loads, shape (ne, 3 * n_nodes)."""
         b[:] = 0.0
         rows = self.cells.ravel()
@@ -145,7 +145,7 @@ class BeamElements:
     def lumped_mass(self, n: int) -> np.ndarray:
         """Return the diagonal masses of the first ``n`` nodes, shape (n, 3), kg and kg m^2; all are positive."""
         m = np.empty((n, WIDTH))
-        self._gather(self._lumped, m)
+        self.gather(self._lumped, m)
         return m
 
     def uniform_load(self, n: int) -> np.ndarray:
@@ -153,7 +153,7 @@ class BeamElements:
         loads = np.empty((2, n, WIDTH))
         for axis in range(2):
             unit = np.tile(np.eye(WIDTH)[axis], self.cells.shape[1])
-            self._gather(self.mass @ unit, loads[axis])
+            self.gather(self.mass @ unit, loads[axis])
         return loads
 
     def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
@@ -210,7 +210,8 @@ def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _scatter_matrix(cells, A, node_ptr, slots, values):
+def scatter_matrices(cells, A, node_ptr, slots, values):
+    """Add matrices of elements, shape (ne, 3 n_nodes, 3 n_nodes), to the values of a pattern."""
     for e in range(cells.shape[0]):
         for p in range(cells.shape[1]):
             row = cells[e, p]

@@ -15,8 +15,8 @@ _SLOPE = np.array([[36, 3, -36, 3], [3, 4, -3, -1], [-36, -3, 36, -3], [3, -1, -
 _CURVATURE = np.array([[12.0, 6, -12, 6], [6, 4, -6, 2], [-12, -6, 12, -6], [6, 2, -6, 4]])
 
 
-def cubics(xi: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shape functions of (w, theta) at start and end, and their derivatives along the beam.
+def cubics(xi: np.ndarray, length: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shape functions of (w, theta) at start and end, and their derivatives along the beam, (..., 4).
 
     phi_1 = (1 - xi)^2 (2 + xi)/4,      phi_2 = l (1 - xi)^2 (1 + xi)/8,
     phi_3 = (1 + xi)^2 (2 - xi)/4,      phi_4 = l (1 + xi)^2 (xi - 1)/8.
@@ -25,7 +25,7 @@ def cubics(xi: float, length: float) -> tuple[np.ndarray, np.ndarray]:
          (1 + xi) ** 2 * (2 - xi) / 4, length * (1 + xi) ** 2 * (xi - 1) / 8]  # fmt: skip
     slope = [1.5 * (xi**2 - 1) / length, (xi - 1) * (3 * xi + 1) / 4,
              1.5 * (1 - xi**2) / length, (xi + 1) * (3 * xi - 1) / 4]  # fmt: skip
-    return np.array(N), np.array(slope)
+    return np.stack(N, axis=-1), np.stack(slope, axis=-1)
 
 
 class Hermite:
@@ -113,12 +113,10 @@ class Hermite:
         turning = half * self.length**2 * (_MASS[1, 1] / _MASS[0, 0]) + rho_I * self.length / 2
         return np.tile(np.column_stack((half, half, turning)), (1, 2))
 
-    def interpolation(self, e: int, xi: float) -> np.ndarray:
-        """Return what makes (u_x, u_y, theta) at ``xi`` in [-1, 1] of element ``e`` out of its d, shape (3, 6)."""
-        N, slope = cubics(xi, self.length[e])
-        local = np.zeros((3, 6))
-        local[0, _ALONG] = (1 - xi) / 2, (1 + xi) / 2
-        local[1, _ACROSS], local[2, _ACROSS] = N, slope
-        back = np.eye(3)
-        back[:2, :2] = self.turn[e, :2, :2].T
-        return back @ local @ self.turn[e]
+    def interpolation(self, e: np.ndarray, xi: np.ndarray) -> np.ndarray:
+        """Return what makes (u_x, u_y, theta) at ``xi`` in [-1, 1] of each element ``e`` out of its d, (n, 3, 6)."""
+        local = np.zeros((len(e), 3, 6))
+        local[:, 0, _ALONG] = np.column_stack((1 - xi, 1 + xi)) / 2
+        local[:, 1, _ACROSS], local[:, 2, _ACROSS] = cubics(xi, self.length[e])
+        turn = self.turn[e]
+        return turn[:, :3, :3].transpose(0, 2, 1) @ local @ turn

@@ -98,10 +98,10 @@ class Timoshenko:
         each = np.stack((rho_A, rho_A, rho_I), axis=-1) * self.length[:, None]
         return (share[None, :, None] * each[:, None, :]).reshape(-1, 9)
 
-    def interpolation(self, e: int, xi: float) -> np.ndarray:
-        """Return what makes (u_x, u_y, theta) at ``xi`` in [-1, 1] of element ``e`` out of its d, shape (3, 9)."""
-        N, _ = shapes(np.array(xi))
-        return np.kron(N, np.eye(3))
+    def interpolation(self, e: np.ndarray, xi: np.ndarray) -> np.ndarray:
+        """Return what makes (u_x, u_y, theta) at ``xi`` in [-1, 1] of each element ``e`` out of its d, (n, 3, 9)."""
+        N, _ = shapes(xi)
+        return np.einsum("na,ij->niaj", N, np.eye(3)).reshape(-1, 3, 9)
 
 
 _AT_REDUCED = shapes(_REDUCED)

@@ -19,7 +19,7 @@ from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.meshes import SimplexMesh
-from petfsi.geometry.places import Tags, read_tags
+from petfsi.geometry.places import Tags, read_tags, with_middles
 from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, relinearised, stable_step
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
@@ -85,7 +85,7 @@ class NodalSolid(SolidField):
         self._uniform = self._elements.uniform_load(n_owned)
         self._reference_mass = comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points)
 
-        self._tags = on_root(comm, lambda: _tags(scene, solids))
+        self._tags = on_root(comm, lambda: _tags(scene, solids, mesh))
         self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
         self._damping = np.array([[solid.damping.mass, solid.damping.stiffness] for solid in solids.values()])
         self._lumped = self._lump() if self.explicit else None
@@ -416,16 +416,22 @@ class NodalSolid(SolidField):
         return Slab(self._to_natural(owned), (begin, 0), (n, owned.shape[1]))
 
 
+def _tags(scene: Scene, solids: Mapping[str, Solid], mesh: SimplexMesh) -> dict[str, Tags]:
+    """Return the groups of facets that the scene names, by body; numbers are those of the body's own nodes."""
+    found = {}
+    for body, (name, solid) in enumerate(solids.items()):
+        tags = read_tags(solid, scene.dim, f"solids.{name}", scene.directory)
+        elements = mesh.elements(body)
+        found[name] = with_middles(tags, elements - elements.min()) if tags else tags
+    return found
+
+
 def _shortest_edge(mesh: SimplexMesh) -> float:
     """Return the length of the shortest edge of a mesh, m."""
     corners = mesh.points[mesh.cells]
     edges = corners[:, :, None] - corners[:, None]
     a, b = np.triu_indices(mesh.cells.shape[1], 1)
     return float(np.sqrt((edges[:, a, b] ** 2).sum(axis=-1).min()))
-
-
-def _tags(scene: Scene, solids: Mapping[str, Solid]) -> dict[str, Tags]:
-    return {name: read_tags(solid, scene.dim, f"solids.{name}", scene.directory) for name, solid in solids.items()}
 
 
 def _evaluate(

@@ -107,6 +107,10 @@ class LocalMesh:
     natural: np.ndarray
     nodes: Layout
 
+    def elements(self, body: int) -> np.ndarray:
+        """Return the nodes of a body's elements, those of its cells where there are no groups."""
+        return next((group.nodes for group in self.groups if group.body == body), self.cells[self.body == body])
+
     @property
     def connectivity(self) -> list[np.ndarray]:
         """The nodes of the elements of each group, or of the cells."""

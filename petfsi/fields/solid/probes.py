@@ -52,11 +52,11 @@ def locate(comm: MPI.Comm, mesh: LocalMesh, body: int, at: np.ndarray, key: str)
         If it is farther from the nearest node than that node's longest edge.
     """
     dim = mesh.points.shape[1]
-    group = next(group for group in mesh.groups if group.body == body)
-    corners = mesh.points[group.nodes[:, : dim + 1]]
+    elements = mesh.elements(body)
+    corners = mesh.points[elements[:, : dim + 1]]
     slack = 1e-6 * np.ptp(corners, axis=1).max(axis=1, keepdims=True)
     near = np.all((corners.min(axis=1) - slack <= at) & (at <= corners.max(axis=1) + slack), axis=1)
-    nodes, corners = group.nodes[near], corners[near]
+    nodes, corners = elements[near], corners[near]
     offset = np.einsum("eaj,ej->ea", barycentric_gradients(mesh.points, nodes), at - corners.mean(axis=1))
     barycentric = 1 / (dim + 1) + offset
     hits = np.flatnonzero(barycentric.min(axis=1, initial=np.inf) >= SLACK)

@@ -94,6 +94,16 @@ def shape_functions(barycentric: np.ndarray, nodes: int) -> np.ndarray:
     return np.einsum("...i,aij,...j->...a", barycentric, _forms(dim), barycentric)
 
 
+def shape_slopes(barycentric: np.ndarray, nodes: int) -> np.ndarray:
+    """Return their slopes along the edges from the first corner to the others, shape (..., n, dim)."""
+    dim = barycentric.shape[-1] - 1
+    if nodes == dim + 1:
+        gradients = np.broadcast_to(np.eye(dim + 1), (*barycentric.shape[:-1], dim + 1, dim + 1))
+    else:
+        gradients = 2 * np.einsum("aij,...j->...ai", _forms(dim), barycentric)
+    return gradients[..., 1:] - gradients[..., :1]
+
+
 def _forms(dim: int) -> np.ndarray:
     """Return the symmetric Q_a of N_a = x . Q_a x: corners x_a (x_a - the others), middles 4 x_a x_b."""
     corners = dim + 1

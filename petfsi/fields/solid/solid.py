@@ -53,9 +53,8 @@ class SimplexSolid(NodalSolid):
         bodies, places = {}, {}
         for index, (name, solid) in enumerate(solids.items()):
             nodes = np.flatnonzero(self._node_body == index)
-            elements = np.searchsorted(nodes, mesh.cells[mesh.body == index])
-            local = self._mesh.cells[self._mesh.body == index]
-            bodies[name] = Body(nodes, mesh.points[nodes], elements, local, self._tags[name])
+            elements = np.searchsorted(nodes, mesh.elements(index))
+            bodies[name] = Body(nodes, mesh.points[nodes], elements, self._mesh.elements(index), self._tags[name])
             for n, load in enumerate(solid.loads):
                 if load.at is not None:
                     at, key = np.array(load.at), f"solids.{name}.loads.{n}: the force"

@@ -12,12 +12,12 @@ from scipy.sparse import csr_matrix
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.loads.dead import DeadLoads
 from petfsi.fields.solid.loads.followers import FollowerPressure, FollowerTraction
-from petfsi.fields.solid.loads.rules import with_middles
 from petfsi.fields.solid.loads.simplices import Coordinates, Simplices
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.probes import Place
 from petfsi.geometry.places import Tags, located_facets
+from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
@@ -116,9 +116,8 @@ class Loads:
 
     def _add_facets(self, key: str, load: Load, body: Body, skin: np.ndarray | None) -> None:
         assert load.where is not None and skin is not None
-        facets = skin[located_facets(load.where, body.points, skin, key, body.tags)]
-        if body.elements.shape[1] > self.dim + 1:
-            facets = with_middles(facets, body.elements)
+        chosen = skin[located_facets(load.where, body.points, skin, key, body.tags)]
+        facets = facets_with_middles(chosen, body.elements)
         on = Simplices(self._mesh.points, self._local(body.nodes[facets]), self.dim, FACET_POINTS)
         if load.pressure is not None:
             pressure = Expression(load.pressure, key=f"{key}.pressure")
@@ -212,7 +211,7 @@ class _Tangent:
         self._facets, self._n, dim = facets, mesh.n_owned, facets.dim
         nodes = facets.nodes
         unknowns = dim * mesh.number[nodes].astype(np.int64)[:, :, None] + np.arange(dim)
-        unknowns = unknowns.reshape(len(nodes), -1)
+        unknowns = unknowns.reshape(len(nodes), dim * nodes.shape[1])
         row = np.repeat(unknowns - dim * mesh.nodes.start, unknowns.shape[1], axis=1).ravel()
         column = np.tile(unknowns, (1, unknowns.shape[1])).ravel()
         self._chosen = np.repeat(np.repeat(nodes < self._n, dim, axis=1), unknowns.shape[1], axis=1).ravel()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from petfsi.fields.solid.loads.rules import shape_functions, simplex_rule
+from petfsi.fields.solid.loads.rules import simplex_rule
+from petfsi.fields.solid.rules import shape_functions, shape_slopes
 
 Coordinates = dict[str, np.ndarray | float]
 
@@ -38,7 +39,7 @@ class Simplices:
     def __init__(self, points: np.ndarray, nodes: np.ndarray, corners: int, per_axis: int) -> None:
         self.nodes, self.dim, self._reference = nodes, points.shape[1], points
         where, self.rule = simplex_rule(corners - 1, per_axis)
-        self.values, self.slopes = shape_functions(where, nodes.shape[1])
+        self.values, self.slopes = shape_functions(where, nodes.shape[1]), shape_slopes(where, nodes.shape[1])
         edges = self.tangents(points)
         gram = np.einsum("eqik,eqil->eqkl", edges, edges)
         self.weights = self.rule * np.sqrt(np.linalg.det(gram))
