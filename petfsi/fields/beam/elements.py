@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -188,7 +189,7 @@ class BeamElements:
         residual = a * Mw + Cw + k * Kw - self._loads(at, f, K)
         return float(np.sum((w * Cw)[counted])), float(np.sum((g * residual)[counted]))
 
-    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
+    def stiffest(self, d: np.ndarray, mass: np.ndarray, shared: Callable[[np.ndarray], np.ndarray]) -> float:
         """Return a bound on the largest eigenvalue of M^-1 K'(d), M diagonal, 1/s^2: the largest of any element.
 
         Parameters
@@ -196,6 +197,8 @@ class BeamElements:
         d : ndarray, shape (n, 3)
         mass : ndarray, shape (n, 3)
             M, kg and kg m^2; its share in an element is the element's own lumped mass.
+        shared : callable
+            Not needed.
         """
         if len(self.cells) == 0:
             return 0.0

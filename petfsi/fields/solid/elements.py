@@ -323,18 +323,3 @@ class Elements:
                 F = np.eye(self.dim) + batch.gradients(d, part)
                 least = min(least, float(np.linalg.det(F).min()))
         return least
-
-    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
-        """Return no less than the largest eigenvalue of M^-1 K'(d) of these elements, 1/s^2, by their own mass."""
-        most = 0.0
-        for batch in self.batches:
-            if batch.is_patch or len(batch.rule.weights) > 1:
-                continue
-            for part in batch.parts():
-                _, _, C = batch.respond(d, part)
-                G = batch.basis[part]
-                K = np.einsum("e,eaJ,eiJkL,ebL->eaibk", batch.volume[part], G, C, G)
-                K = K.reshape(len(G), G.shape[1] * self.dim, -1)
-                m = batch.lumped.min() * batch.volume[part]
-                most = max(most, float((np.linalg.eigvalsh(K)[:, -1] / m).max()))
-        return most

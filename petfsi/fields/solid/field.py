@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -17,6 +17,7 @@ from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.lumped import LumpedEquation
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
+from petfsi.fields.solid.spectrum import largest_eigenvalue
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
@@ -119,6 +120,7 @@ class NodalSolid(SolidField):
         self.moved = np.zeros(self.layout.n_local)
         self._stage: Stage | None = None
         self._geometry: np.ndarray | None = None
+        self._stiff_mode: np.ndarray | None = None
         self._loaded: tuple[Stage, State, np.ndarray] | None = None
         self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
         self._past_dt = 0.0
@@ -270,14 +272,42 @@ class NodalSolid(SolidField):
         """Forget the step begun."""
         self._stage = self._geometry = None
 
-    def stable_step(self) -> float:
-        """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
+    def stable_step(self, sharp: bool) -> float:
+        """Return the longest stable step at the present displacement, s. Collective.
+
+        From the largest eigenvalue of any element, or, if it must be sharp, that of the free nodes' M^-1 K'.
+        """
         if self._lumped is None:
             return np.inf
-        shared = self._with_shared(np.concatenate((self.displacement, self._lumped.mass), axis=1))
+        mass = self._lumped.mass
+        shared = self._with_shared(np.concatenate((self.displacement, mass), axis=1))
         self._measured = shared[:, : self.width]
-        eigenvalue = self._elements.stiffest(self._measured, shared[:, self.width :])
-        return stable_step(self.comm.allreduce(eigenvalue, MPI.MAX), float(self._damping[:, 1].max()))
+        if sharp:
+            if self._stiff_mode is None:  # as good as any, and the same again in a run that goes on
+                here = self._mesh.natural[: len(mass), None] + np.arange(self.width) / self.width
+                self._stiff_mode = np.cos(here)
+            product = self._stiffness_product(self._measured)
+            eigenvalue, self._stiff_mode = largest_eigenvalue(self.comm, product, mass, self._stiff_mode)
+        else:
+            bound = self._elements.stiffest(self._measured, shared[:, self.width :], self._with_shared)
+            eigenvalue = self.comm.allreduce(bound, MPI.MAX)
+        return stable_step(eigenvalue, float(self._damping[:, 1].max()))
+
+    def _stiffness_product(self, d: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the product with K'(d) of the free nodes, for owned values; d holds all local nodes."""
+        rest, free = np.zeros_like(d), ~self._is_held[: self._mesh.n_owned]
+        pull, moved = np.empty_like(self.displacement), np.empty_like(self.displacement)
+        self._elements.forces(State(d, rest, rest), pull)
+
+        def product(v: np.ndarray) -> np.ndarray:
+            self._elements.forces(State(d, rest, self._with_shared(np.where(free, v, 0.0))), moved)
+            return np.where(free, pull - moved, 0.0)
+
+        return product
+
+    def forget(self) -> None:
+        """Forget where the search for the stable step begins."""
+        self._stiff_mode = None
 
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -30,8 +31,11 @@ class ElementLibrary(Protocol):
         """Return the diagonal of the lumped mass at the first ``n`` nodes, shape (n, width), kg."""
         ...
 
-    def stiffest(self, d: np.ndarray, mass: np.ndarray) -> float:
-        """Return no less than the largest eigenvalue of M^-1 K'(d), M diagonal, of these elements, 1/s^2."""
+    def stiffest(self, d: np.ndarray, mass: np.ndarray, shared: Callable[[np.ndarray], np.ndarray]) -> float:
+        """Return a bound of the eigenvalues of M^-1 K'(d), M diagonal, 1/s^2: the largest of all ranks'. Collective.
+
+        ``shared`` returns values at all local nodes from those at this rank's own ones, shape (n_owned, 1).
+        """
         ...
 
     def uniform_load(self, n: int) -> np.ndarray:
