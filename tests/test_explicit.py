@@ -1,5 +1,7 @@
 """Explicit steps: their limit, what becomes of steps above it, and the energy below it. About 15 s."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -67,7 +69,7 @@ def test_a_step_above_the_limit_is_refused_at_the_start(material):
 @pytest.mark.parallel([1, 2])
 def test_a_limit_that_falls_below_the_step_ends_the_run():
     """Neo-Hookean elements stiffen when they are pressed together."""
-    pressed = {"velocity": ["-4*x", 0.0]}
+    pressed = {"velocity": ["-x", 0.0]}
     with prepared(explicit(initial=pressed)) as sim:
         limit = sim.solid.stable_step(sharp=True)
     with prepared(explicit({"dt": 0.97 * limit}, initial=pressed)) as sim:
@@ -109,8 +111,10 @@ def energies(scene, n, every, bypass=False):
 
 
 def near_limit(part, **more):
-    scene = explicit(output={"accounts": False}, initial=SWING, **more)
-    return explicit({"dt": part * true_limit(scene)}, output={"accounts": False}, initial=SWING, **more)
+    """Return a scene with steps of a part of the true limit, but for the first one, which is looked at."""
+    more |= {"output": {"accounts": False}, "initial": SWING}
+    h = true_limit(explicit(**more))
+    return explicit({"dt": f"{h}*(0.9 + {part - 0.9}*heaviside(t - 1e-9))"}, **more)
 
 
 def test_the_energy_stays_bounded_just_below_the_limit_and_not_above():
@@ -133,12 +137,14 @@ def test_the_energy_stays_bounded_for_long(material, part):
 
 @pytest.mark.parallel([1, 3])
 @pytest.mark.parametrize(
-    "scene, sets", [("bar2d", ("solids.bar.density=2000", "solids.bar.damping={}")), ("sheet", ())]
+    "scene, sets",
+    [
+        ("bar2d", ("solids.bar.density=2000", "solids.bar.damping={}", "solids.bar.mass=lumped")),
+        ("sheet", ("solids.sheet.mass=lumped",)),
+    ],
 )
 def test_coupled_explicit_steps_agree_with_implicit_ones(scene, sets):
     """To first order; the matrix is assembled once and survives unknowns of the fluid that come and go."""
-    from pathlib import Path
-
     path = Path(__file__).parent / "scenes" / f"{scene}.toml"
     h = {"bar2d": 1 / 480, "sheet": 2e-5}[scene]
     n = {"bar2d": 24, "sheet": 10}[scene]
@@ -150,5 +156,5 @@ def test_coupled_explicit_steps_agree_with_implicit_ones(scene, sets):
     errors = [np.abs(motion(run("symplectic-euler", h / m, n * m)) - exact).max() for m in (1, 2)]
     sim = run("symplectic-euler", h, n)
     assert sim.solid.n_assembled == 1 and sim.divergence() < 1e-6
-    assert errors[0] < 0.1 * np.abs(exact).max()
-    assert errors[1] < 0.7 * errors[0]
+    assert errors[0] < 0.2 * np.abs(exact).max()
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.3), errors

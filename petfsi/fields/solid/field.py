@@ -283,9 +283,9 @@ class NodalSolid(SolidField):
         shared = self._with_shared(np.concatenate((self.displacement, mass), axis=1))
         self._measured = shared[:, : self.width]
         if sharp:
-            if self._stiff_mode is None:  # as good as any, and the same again in a run that goes on
-                here = self._mesh.natural[: len(mass), None] + np.arange(self.width) / self.width
-                self._stiff_mode = np.cos(here)
+            if self._stiff_mode is None:  # rough, so that no mode lacks, and the same again in a run that goes on
+                number = self.width * self._mesh.natural[: len(mass), None] + np.arange(self.width)
+                self._stiff_mode = np.modf(43758.5453 * np.sin(12.9898 * (number + 1)))[0]
             product = self._stiffness_product(self._measured)
             eigenvalue, self._stiff_mode = largest_eigenvalue(self.comm, product, mass, self._stiff_mode)
         else:

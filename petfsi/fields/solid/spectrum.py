@@ -108,7 +108,9 @@ def largest_eigenvalue(
 
     q = root * start
     q = q / np.sqrt(dot(q, q))
-    basis, diagonal, beside = [q], [], []
+    basis = [q]
+    diagonal: list[float] = []
+    beside: list[float] = []
     while True:
         r = apply(q / root) / root
         diagonal.append(dot(q, r))
