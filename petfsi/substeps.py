@@ -21,11 +21,10 @@ MOST = 100_000
 class StableStep:
     """Keeps a step below the stable one, as ``time.above_limit`` says.
 
-    Finding the stable step costs more than a step, and some 20 of them where a bound from single elements is not
-    enough for the step that is wanted. It is found before the first step, every ``EVERY`` steps, after ``forget``,
-    and when the body may have changed too much since: the ends of an edge can have moved apart by twice the way of
-    the fastest node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once is enough
-    where it never changes.
+    Finding the stable step costs some 30 steps. It is found before the first step, every ``EVERY`` steps, after
+    ``forget``, and when the body may have changed too much since: the ends of an edge can have moved apart by twice
+    the way of the fastest node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once
+    is enough where it never changes.
 
     Parameters
     ----------
@@ -45,7 +44,7 @@ class StableStep:
         self._solid = solid
         self.limited = solid is not None and solid.explicit
         self._subcycles = time.above_limit == "subcycle"
-        self.limit, self._is_sharp = math.inf, False
+        self.limit = math.inf
         self._steps, self._way, self._stretch = EVERY, 0.0, 0.0
 
     @property
@@ -56,8 +55,6 @@ class StableStep:
     def forget(self) -> None:
         """Find the stable step anew before the next step."""
         self._steps = EVERY
-        if self._solid is not None:
-            self._solid.forget()
 
     def count(self, t: float, dt: float) -> int:
         """Return into how many equal steps one of length dt that begins at t must be divided. Collective.
@@ -71,7 +68,7 @@ class StableStep:
         """
         if not self.limited:
             return 1
-        self._find(dt)
+        self._find()
         if self._subcycles:
             if not dt < MOST * self.limit:
                 raise SolveError(f"the solid has blown up: its stable step is {self.limit:.4g} s at t = {t:g} s")
@@ -84,7 +81,7 @@ class StableStep:
             )
         return 1
 
-    def _find(self, dt: float) -> None:
+    def _find(self) -> None:
         solid = self._solid
         assert solid is not None
         due = self._steps >= EVERY
@@ -92,10 +89,7 @@ class StableStep:
             self._stretch, self._way = solid.stretch(), 0.0
             due = not self._stretch < STRETCH / 2
         if due:
-            self.limit, self._is_sharp = solid.stable_step(sharp=False), False
-            self._steps, self._way, self._stretch = 0, 0.0, 0.0
-        if not self._is_sharp and dt > (MARGIN if self._subcycles else 1.0) * self.limit:
-            self.limit, self._is_sharp = solid.stable_step(sharp=True), True
+            self.limit = solid.stable_step()
             self._steps, self._way, self._stretch = 0, 0.0, 0.0
 
     def moved(self, way: float) -> None:

@@ -142,17 +142,6 @@ def test_a_rigid_motion_has_its_exact_momentum_and_energy(theory, lumped):
         assert turn @ M @ turn == pytest.approx(mass * 2.0**2 / 3 + mass * 0.2**2 / 12)
 
 
-def test_the_stiffest_element_bounds_the_highest_frequency(theory):
-    elements, points = row(theory, 8, section(0.05, 7.0))
-    d = np.zeros((len(points), 3))
-    mass = elements.lumped_mass(len(points))
-    root = np.sqrt(mass.ravel())
-    highest = np.linalg.eigvalsh(respond(elements, d)[2] / np.outer(root, root)).max()
-    bound = elements.stiffest(d, mass)
-    assert highest <= bound * (1 + 1e-12)
-    assert bound <= 1.2**2 * highest
-
-
 def test_interpolation_finds_what_nodes_say(theory):
     elements, points = row(theory, 2, section(0.05), 1.0, angle=0.6)
     slope = np.array([-np.sin(0.6), np.cos(0.6)])

@@ -251,23 +251,12 @@ class SolidField(Field):
     is_linear: bool = False
 
     @abstractmethod
-    def stable_step(self, sharp: bool) -> float:
-        """Return the longest stable step of an explicit scheme at the present state, s. Collective.
-
-        Parameters
-        ----------
-        sharp : bool
-            Whether it may cost some 20 steps to find it to a few per cent; otherwise what comes back is cheap and no
-            longer than that.
-        """
+    def stable_step(self) -> float:
+        """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
 
     @abstractmethod
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
-
-    @abstractmethod
-    def forget(self) -> None:
-        """Forget what a resumed run could not know."""
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -188,23 +187,6 @@ class BeamElements:
         Cw = a0 * Mw + a1 * Kw
         residual = a * Mw + Cw + k * Kw - self._loads(at, f, K)
         return float(np.sum((w * Cw)[counted])), float(np.sum((g * residual)[counted]))
-
-    def stiffest(self, d: np.ndarray, mass: np.ndarray, shared: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Return a bound on the largest eigenvalue of M^-1 K'(d), M diagonal, 1/s^2: the largest of any element.
-
-        Parameters
-        ----------
-        d : ndarray, shape (n, 3)
-        mass : ndarray, shape (n, 3)
-            M, kg and kg m^2; its share in an element is the element's own lumped mass.
-        shared : callable
-            Not needed.
-        """
-        if len(self.cells) == 0:
-            return 0.0
-        _, _, K = self.theory.respond(self._of_elements(d))
-        root = np.sqrt(self._lumped)
-        return float(np.linalg.eigvalsh(K / (root[:, :, None] * root[:, None, :])).max())
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:

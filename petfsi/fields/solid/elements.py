@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.patches import barycentric_gradients
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.rules import Rule, linear_rule, patch_rule, quadratic_rule
-from petfsi.fields.solid.spectrum import add_row_sums, pencil_bound
 from petfsi.geometry.meshes import Group
 
 #: Quadrature points handled at a time: their tangents stay in a core's cache.
@@ -279,41 +278,6 @@ class Elements:
                 batch.loops.contract(C, batch.gradients(at.shift, part), P)
                 power += float(weights @ ((P + (k + a1) * stress) * slope).sum(axis=(1, 2)))
         return damping, power
-
-    # ---- the spectrum -----------------------------------------------------------------------------------------
-
-    def stiffest(self, d: np.ndarray, mass: np.ndarray, shared: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Return a bound of the eigenvalues of M^-1 K'(d), 1/s^2: the largest of all ranks' is one. Collective.
-
-        See ``pencil_bound``. In steps (2 over its root) it is 0.6 to 1 times what is stable, least for linear
-        tetrahedra and for patches, whose simplices bound the one part of the stiffness and they the other.
-
-        Parameters
-        ----------
-        d, mass : ndarray, shape (n, dim)
-            Displacement and lumped mass of all local nodes.
-        shared : callable
-            From values at this rank's own nodes, shape (n_owned, 1), to those at all local nodes.
-        """
-        total = np.zeros(len(d))
-        for batch in self.batches:
-            for part in batch.parts():
-                add_row_sums(batch.cells[part], self._matrices(batch, part, d), total)
-        everywhere = shared(total[:, None])[:, 0]
-        most = 0.0
-        for batch in self.batches:
-            for part in batch.parts():
-                bound = pencil_bound(batch.cells[part], self._matrices(batch, part, d), everywhere, mass)
-                most = bound if not bound <= most else most
-        return most
-
-    def _matrices(self, batch: _Batch, part: slice, d: np.ndarray) -> np.ndarray:
-        """Return K' of each element, shape (count, n * dim, n * dim)."""
-        _, _, C = batch.respond(d, part)
-        size = batch.cells.shape[1] * self.dim
-        K = np.empty((part.stop - part.start, size, size))
-        batch.loops.matrices(batch.cells[part], batch.basis[part], batch.rule.table, batch.weights[part], C, K)
-        return K
 
     def smallest_ratio(self, d: np.ndarray) -> float:
         """Return the smallest det F of this rank's quadrature points."""

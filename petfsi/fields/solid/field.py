@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -120,7 +120,6 @@ class NodalSolid(SolidField):
         self.moved = np.zeros(self.layout.n_local)
         self._stage: Stage | None = None
         self._geometry: np.ndarray | None = None
-        self._stiff_mode: np.ndarray | None = None
         self._loaded: tuple[Stage, State, np.ndarray] | None = None
         self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
         self._past_dt = 0.0
@@ -272,42 +271,24 @@ class NodalSolid(SolidField):
         """Forget the step begun."""
         self._stage = self._geometry = None
 
-    def stable_step(self, sharp: bool) -> float:
-        """Return the longest stable step at the present displacement, s. Collective.
-
-        From the largest eigenvalue of any element, or, if it must be sharp, that of the free nodes' M^-1 K'.
-        """
+    def stable_step(self) -> float:
+        """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
         if self._lumped is None:
             return np.inf
-        mass = self._lumped.mass
-        shared = self._with_shared(np.concatenate((self.displacement, mass), axis=1))
-        self._measured = shared[:, : self.width]
-        if sharp:
-            if self._stiff_mode is None:  # rough, so that no mode lacks, and the same again in a run that goes on
-                number = self.width * self._mesh.natural[: len(mass), None] + np.arange(self.width)
-                self._stiff_mode = np.modf(43758.5453 * np.sin(12.9898 * (number + 1)))[0]
-            product = self._stiffness_product(self._measured)
-            eigenvalue, self._stiff_mode = largest_eigenvalue(self.comm, product, mass, self._stiff_mode)
-        else:
-            bound = self._elements.stiffest(self._measured, shared[:, self.width :], self._with_shared)
-            eigenvalue = self.comm.allreduce(bound, MPI.MAX)
-        return stable_step(eigenvalue, float(self._damping[:, 1].max()))
-
-    def _stiffness_product(self, d: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the product with K'(d) of the free nodes, for owned values; d holds all local nodes."""
+        d = self._measured = self._with_shared(self.displacement)
         rest, free = np.zeros_like(d), ~self._is_held[: self._mesh.n_owned]
-        pull, moved = np.empty_like(self.displacement), np.empty_like(self.displacement)
-        self._elements.forces(State(d, rest, rest), pull)
+        here, there = np.empty_like(self.displacement), np.empty_like(self.displacement)
+        self._elements.forces(State(d, rest, rest), here)
 
-        def product(v: np.ndarray) -> np.ndarray:
-            self._elements.forces(State(d, rest, self._with_shared(np.where(free, v, 0.0))), moved)
-            return np.where(free, pull - moved, 0.0)
+        def stiffness(v: np.ndarray) -> np.ndarray:
+            self._elements.forces(State(d, rest, self._with_shared(v)), there)
+            return np.where(free, here - there, 0.0)
 
-        return product
-
-    def forget(self) -> None:
-        """Forget where the search for the stable step begins."""
-        self._stiff_mode = None
+        # the same on any number of ranks, and in a run resumed
+        start = np.sin(1.0 + np.arange(len(self._number) * self.width) ** 2).reshape(-1, self.width)
+        start = np.where(free, start[self._mesh.natural[: self._mesh.n_owned]], 0.0)
+        eigenvalue = largest_eigenvalue(self.comm, stiffness, self._lumped.mass, start)
+        return stable_step(eigenvalue, float(self._damping[:, 1].max()))
 
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""

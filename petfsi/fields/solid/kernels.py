@@ -22,7 +22,6 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
         kinetic(cells, volume, mass, u, v)          returns the sum of volume mass_ab u_a . v_b
         tangent(cells, basis, table, w, C, volume, mass, A_M, A_K, node_ptr, slots, values)
                                                     A_M volume mass_ab I + A_K w g_a . C . g_b, into the rows' values
-        matrices(cells, basis, table, w, C, K)      K = w g_a . C . g_b of each element
 
     Points lie element after element, (ne * Q, dim, dim); ``w`` has shape (ne, Q).
 
@@ -189,25 +188,6 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                             else:
                                 values[start + i * width + k] += K[b, a, k, i]
 
-    @njit(cache=True)
-    def matrices(cells, basis, table, w, C, K):
-        n_points = table.shape[0]
-        g, Cg = np.empty((nodes, dim)), np.empty((dim, dim, dim))
-        half = np.empty((nodes, nodes, dim, dim))
-        for e in range(cells.shape[0]):
-            clear(half)
-            for q in range(n_points):
-                shape_gradients(basis[e], table[q], g)
-                add_stiffness(g, C[e * n_points + q], w[e, q], Cg, half)
-            close(half)
-            for a in range(nodes):
-                for b in range(a, nodes):
-                    for i in range(dim):
-                        for k in range(dim):
-                            K[e, a * dim + i, b * dim + k] = half[a, b, i, k]
-                            K[e, b * dim + k, a * dim + i] = half[a, b, i, k]
-
     return SimpleNamespace(
         gradient=gradient, contract=contract, forces=forces, kinetic=kinetic, tangent=tangent,
-        matrices=matrices,
     )  # fmt: skip

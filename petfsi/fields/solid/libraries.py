@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -29,13 +28,6 @@ class ElementLibrary(Protocol):
 
     def lumped_mass(self, n: int) -> np.ndarray:
         """Return the diagonal of the lumped mass at the first ``n`` nodes, shape (n, width), kg."""
-        ...
-
-    def stiffest(self, d: np.ndarray, mass: np.ndarray, shared: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Return a bound of the eigenvalues of M^-1 K'(d), M diagonal, 1/s^2: the largest of all ranks'. Collective.
-
-        ``shared`` returns values at all local nodes from those at this rank's own ones, shape (n_owned, 1).
-        """
         ...
 
     def uniform_load(self, n: int) -> np.ndarray:
