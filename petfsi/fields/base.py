@@ -255,6 +255,10 @@ class SolidField(Field):
         """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
 
     @abstractmethod
+    def stretch(self) -> float:
+        """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
+
+    @abstractmethod
     def set_scale(self, reference_mass: float) -> None:
         """Measure rows against this mass, kg: that of a fluid cell."""
 
