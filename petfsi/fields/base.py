@@ -229,8 +229,6 @@ class SolidField(Field):
 
     Attributes
     ----------
-    width : int
-        Unknowns a node; the first ones are velocities along the axes.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
@@ -243,7 +241,6 @@ class SolidField(Field):
         Whether its tangent never changes, and neither does the stable step.
     """
 
-    width: int
     extent: float
     moved: np.ndarray
     finest: float
@@ -253,6 +250,10 @@ class SolidField(Field):
     @abstractmethod
     def stable_step(self) -> float:
         """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
+
+    @abstractmethod
+    def along_axes(self, x: np.ndarray) -> np.ndarray:
+        """Return the velocities along the axes of this rank's nodes from unknowns x (SI), shape (n, dim)."""
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:
