@@ -96,6 +96,8 @@ def skipped(scene: Scene) -> list[str]:
         out.append("solver: the mass is lumped, A is diagonal; no option under -fsi_ is read")
     if scene.time.integrator == "static":
         out.append("inertia: the integrator is static")
+    if scene.solids and not any(solid.loads or solid.body_force for solid in scene.solids.values()):
+        out.append("loads: there are none")
     if scene.gravity is None:
         out.append("gravity: not given")
     if scene.solids and all(s.damping.mass == 0 and s.damping.stiffness == 0 for s in scene.solids.values()):
