@@ -144,10 +144,16 @@ def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, o
 def test_a_stopped_run_of_a_solid_alone_goes_on_bit_for_bit(integrator, ranks, tmp_path):
     """In statics under a growing load; explicitly in sub-steps whose number changes."""
     texts = {
-        "static": ("gravity=[0, '-20*t']", "time.dt='(1 + t)/40'", "time.end=0.5"),
-        "symplectic-euler": ("time.dt='(1 + 20*t)/1000'", "time.above_limit=subcycle", "time.end=0.06"),
+        "static": ("gravity=[0, '-2*t']", "time.dt='(1 + t)/20'", "time.end=0.8", "checkpoint.every=0.3"),
+        "symplectic-euler": (
+            "time.dt='(1 + 20*t)/1000'",
+            "time.above_limit=subcycle",
+            "time.end=0.03",
+            "checkpoint.every=0.01",
+        ),
     }[integrator]
-    words = [f"time.integrator={integrator}", "solids.strip.material=neohookean", "checkpoint.every=0.02", *texts]
+    words = [f"time.integrator={integrator}", "solids.strip.material=neohookean", *texts]
+    words.append("solids.strip.shape.box.cells=[12, 2]")
     sets = [word for text in words for word in ("--set", text)]
     for name, steps in (("straight", ()), ("stopped", ("--steps", 7))):
         petfsi("run", SCENES / "beam.toml", "--out", tmp_path / name, *sets, *steps, ranks=ranks)
@@ -156,7 +162,7 @@ def test_a_stopped_run_of_a_solid_alone_goes_on_bit_for_bit(integrator, ranks, t
     assert histories[0] == histories[1]
     history = read_history(tmp_path / "straight" / "history.csv")
     column = {"static": "newton", "symplectic-euler": "substeps"}[integrator]
-    assert len(history["step"]) > 12 and len(set(history[column][1:])) > 1 and abs(history["tip.y"][-1]) > 1e-3
+    assert len(history["step"]) > 12 and history[column].max() > 1 and abs(history["tip.y"][-1]) > 1e-3
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
