@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -67,11 +67,11 @@ class Newton:
     solver : LinearSolver
     prefix : str
         Of the options: ``prefix + "snes_..."``.
-    line_search : str
-        The ``snes_linesearch_type`` unless options give one.
+    defaults : mapping of str to str
+        What is in force unless options say otherwise: ``{"snes_linesearch_type": "bt"}``.
     """
 
-    def __init__(self, system: System, solver: LinearSolver, prefix: str, line_search: str) -> None:
+    def __init__(self, system: System, solver: LinearSolver, prefix: str, defaults: Mapping[str, str]) -> None:
         self.system, self.solver = system, solver
         self._x = system.solution.duplicate()
         self._function = system.rhs.duplicate()
@@ -90,20 +90,20 @@ class Newton:
         inner.setType(PETSc.KSP.Type.PREONLY)
         inner.getPC().setType(PETSc.PC.Type.PYTHON)
         inner.getPC().setPythonContext(_Correction(self))
-        self._read_options(line_search)
+        self._read_options(defaults)
         if snes.getType() != PETSc.SNES.Type.NEWTONLS:
             raise InputError(f"option -{prefix}snes_type: must be {' or '.join(KINDS)}")
         snes.setUp()
         snes.setUpdate(self._aim)
         self._reads_floor = not PETSc.Options(prefix).hasName("snes_atol")
 
-    def _read_options(self, line_search: str) -> None:
-        options, name = PETSc.Options(self.snes.getOptionsPrefix()), "snes_linesearch_type"
-        chosen = options.hasName(name)
-        if not chosen:
-            options.setValue(name, line_search)
+    def _read_options(self, defaults: Mapping[str, str]) -> None:
+        options = PETSc.Options(self.snes.getOptionsPrefix())
+        missing = [name for name in defaults if not options.hasName(name)]
+        for name in missing:
+            options.setValue(name, defaults[name])
         self.snes.setFromOptions()
-        if not chosen:
+        for name in missing:
             options.delValue(name)
 
     def release(self) -> None:

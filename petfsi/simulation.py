@@ -206,8 +206,7 @@ class Simulation:
 
     def _check_speed(self, solid: SolidField, velocity: np.ndarray, dt: float) -> None:
         """Raise if a node would cross the whole scene in one step: the state has blown up."""
-        along = velocity.reshape(-1, solid.width)[:, : self.scene.dim]  # a beam's rotations are no way to go
-        fastest = self.comm.allreduce(float(np.abs(along).max(initial=0.0)), MPI.MAX)
+        fastest = self.comm.allreduce(float(np.abs(solid.along_axes(velocity)).max(initial=0.0)), MPI.MAX)
         extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
         if self.stable.limited:
             self.stable.moved(fastest * dt)

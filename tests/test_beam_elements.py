@@ -117,6 +117,8 @@ def test_assembly_and_powers_are_those_of_the_sums(theory, lumped):
     np.testing.assert_array_equal(b, alone)
     counted = np.ones(len(elements.cells), dtype=bool)
     w_, g_ = w.ravel(), g.ravel()
+    elements.forces(State(d, V, 0 * s), alone)
+    np.testing.assert_allclose(alone.ravel(), M @ V.ravel() - f, atol=1e-12)
     lost, done = elements.powers(at, 5.0, 0.1, w, g, counted)
     assert lost == pytest.approx(w_ @ C @ w_, rel=1e-12)
     assert done == pytest.approx(g_ @ (A @ w_ - b.ravel()), rel=1e-12)

@@ -86,6 +86,20 @@ BROKEN = [
     ([f"solids.gate.shape={BOX}"], "solids.gate.supports.0.fix", "only a beam has an angle"),
     ([f"solids.gate.shape={BOX}"], "solids.gate.initial.velocity", "must have 2 items"),
     ([f"solids.gate.shape={BOX}"], "probes.tip.quantity", "only a beam has an angle"),
+    (["solids.gate.loads=[{ moment = 1.0 }]"], "solids.gate.loads.0.at", "is missing; a force needs it"),
+    (["solids.gate.loads=[{ at = [0.5, 0.5], moment = 'q' }]"], 'loads.0.moment = "q"', "unknown name 'q'"),
+    (
+        ["solids.gate.loads=[{ at = [0.5, 0.5], moment = [1.0] }]"],
+        "loads.0.moment",
+        "must be a number or an expression",
+    ),
+    (["solids.gate.loads=[{ where = 'all', moment = 1.0 }]"], "solids.gate.loads.0.where", "a force has at instead"),
+    (["solids.gate.loads=[{ at = [0.5], force = [1.0, 0.0] }]"], "solids.gate.loads.0.at", "must have 2 items"),
+    (
+        [other(BOX).replace("young = 1.0", "young = 1.0, loads = [{ at = [1.0, 0.2], moment = 1.0 }]")],
+        "solids.other.loads.0.moment",
+        "only a beam feels a moment",
+    ),
     (["probes.tip.of=fluid"], "probes.tip.quantity", "a fluid has velocity, pressure and smoke"),
     (["probes.tip.quantity=smoke"], "probes.tip.quantity", "a solid has displacement and velocity, a beam an angle"),
     (

@@ -229,8 +229,6 @@ class SolidField(Field):
 
     Attributes
     ----------
-    width : int
-        Unknowns a node; the first ones are velocities along the axes.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
@@ -243,7 +241,6 @@ class SolidField(Field):
         Whether its tangent never changes, and neither does the stable step.
     """
 
-    width: int
     extent: float
     moved: np.ndarray
     finest: float
@@ -257,6 +254,10 @@ class SolidField(Field):
     @abstractmethod
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
+
+    @abstractmethod
+    def along_axes(self, x: np.ndarray) -> np.ndarray:
+        """Return the velocities along the axes of this rank's nodes from unknowns x (SI), shape (n, dim)."""
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:

@@ -54,14 +54,17 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
 
 def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
     """Return a sentence for every support and every load that finds nothing to act on."""
-    points, cells = mesh
+    points, facets = _held_points(solid, mesh[0]), mesh[1][:0, :-1]
+    if solid.shape.beam is not None:
+        facets = axis_mesh(solid.shape.beam)[1]
+    elif solid.loads:
+        facets = boundary_facets(*mesh)
     mistakes = []
     for n, support in enumerate(solid.supports):
         try:
-            located(support.where, _held_points(solid, points), f"{key}.supports.{n}", tags)
+            located(support.where, points, f"{key}.supports.{n}", tags)
         except InputError as error:
             mistakes.append(str(error))
-    facets = boundary_facets(points, cells) if solid.loads else cells[:0, :-1]
     for n, load in enumerate(solid.loads):
         try:
             if load.where is not None:

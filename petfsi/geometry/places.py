@@ -117,7 +117,7 @@ def located_facets(
     points : ndarray, shape (n, dim)
         m.
     facets : ndarray of int, shape (n_facets, dim)
-        All boundary facets of the body.
+        All boundary facets of the body; of a beam its elements.
     key : str
         Where the table with ``where`` stands in the scene, for messages.
     tags : Tags
@@ -140,7 +140,9 @@ def located_facets(
     else:
         chosen = located(where, points, key, tags)[facets].all(axis=1)
     if not chosen.any():
-        raise InputError(f"{key}.where: none of the {len(facets)} boundary facets of the solid lies there whole")
+        raise InputError(
+            f"{key}.where: none of the {len(facets)} boundary facets (of a beam: elements) lies there whole"
+        )
     return chosen
 
 

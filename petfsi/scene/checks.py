@@ -326,8 +326,9 @@ def expressions(scene: Scene) -> Iterator[tuple[str, float | str, tuple[str, ...
             key = f"solids.{name}.loads.{n}"
             yield from each(f"{key}.traction", load.traction, (*space, "t"))
             yield from each(f"{key}.force", load.force, (*space, "t"))
-            if load.pressure is not None:
-                yield f"{key}.pressure", load.pressure, (*space, "t")
+            for quantity in ("pressure", "moment"):
+                if getattr(load, quantity) is not None:
+                    yield f"{key}.{quantity}", getattr(load, quantity), (*space, "t")
 
 
 def _expressions(scene: Scene) -> Problems:

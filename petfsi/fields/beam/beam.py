@@ -76,10 +76,9 @@ class BeamSolid(NodalSolid):
     def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> BeamLoads | None:
         if not any(solid.loads or solid.body_force for solid in solids.values()):
             return None
-        axes = {name: axis_mesh(beam)[0] for name, beam in self._beams.items()}
-        first = dict(zip(self.names, self._first.tolist(), strict=False))
-        there = self._mesh, self._elements, self._pattern
-        return BeamLoads(self.comm, solids, *there, axes, first, self.place)
+        counts = np.cumsum([0, *(beam.elements for beam in self._beams.values())])
+        first = dict(zip(self.names, counts.tolist(), strict=False))
+        return BeamLoads(self.comm, solids, self._mesh, self._elements, self._pattern, first, self.place)
 
     def _sections(self, solids: Mapping[str, Solid]) -> Sections:
         def of(name: str) -> np.ndarray:

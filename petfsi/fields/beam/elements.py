@@ -132,8 +132,10 @@ class BeamElements:
 
     def forces(self, at: State, b: np.ndarray) -> None:
         """Fill b alone, as ``assemble`` does. Not collective."""
-        _, f, K = self.theory.respond(self._of_elements(at.displacement))
-        self.gather(self._loads(at, f, K), b)
+        shifted = bool(at.shift.any())
+        _, f, K = self.theory.respond(self._of_elements(at.displacement), shifted)
+        inertia = _times(self.mass, self._of_elements(at.inertia))
+        self.gather(self._loads(at, f, K) if shifted else inertia - f, b)
 
     def gather(self, loads: np.ndarray, b: np.ndarray) -> None:
         """Fill the first nodes' b with the sums of elements' loads, shape (ne, 3 * n_nodes)."""
@@ -158,7 +160,7 @@ class BeamElements:
 
     def energies(self, d: np.ndarray, u: np.ndarray, counted: np.ndarray) -> tuple[float, float]:
         """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
-        W, _, _ = self.theory.respond(self._of_elements(d))
+        W, _, _ = self.theory.respond(self._of_elements(d), False)
         u = self._of_elements(u)
         return float(0.5 * np.sum((u * _times(self.mass, u))[counted])), float(W[counted].sum())
 

@@ -78,8 +78,10 @@ class Hermite:
     def _turned(self, local: np.ndarray) -> np.ndarray:
         return self.turn.transpose(0, 2, 1) @ local @ self.turn
 
-    def respond(self, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def respond(self, d: np.ndarray, tangent: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return energy, its gradient and its Hessian, of shapes (ne,), (ne, 6) and (ne, 6, 6).
+
+        Without ``tangent`` the Hessian has the shape (0, 6, 6).
 
         Parameters
         ----------
@@ -93,9 +95,12 @@ class Hermite:
         de = self._stretch + tilted / self.length[:, None]
         W = 0.5 * (EA_l * e**2 + np.sum(q * bent, axis=1))
         f = (EA_l * e)[:, None] * de + bent
+        f = np.einsum("eji,ej->ei", self.turn, f)
+        if not tangent:
+            return W, f, np.zeros((0, 6, 6))
         K = EA_l[:, None, None] * de[:, :, None] * de[:, None, :] + self._bending
         K += (self.stiffness[:, 0] * e)[:, None, None] * self._slope
-        return W, np.einsum("eji,ej->ei", self.turn, f), self._turned(K)
+        return W, f, self._turned(K)
 
     def mass(self, rho_A: np.ndarray, rho_I: np.ndarray) -> np.ndarray:
         """Return the consistent mass matrices, shape (ne, 6, 6), with the rotary inertia ∫ rho I w' w' ds."""

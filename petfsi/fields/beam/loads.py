@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.errors import InputError
 from petfsi.fields.beam.elements import WIDTH, BeamElements, scatter_matrices
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.geometry.beams import axis_mesh
-from petfsi.geometry.places import located
+from petfsi.geometry.places import located_facets
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Load, Number, Solid
@@ -104,20 +103,18 @@ class BeamLoads:
         Of the mesh.
     pattern : Pattern
         Of the block.
-    axes : mapping of str to ndarray, shape (n, 2)
-        All nodes of each body at rest, from start to end.
     first : mapping of str to int
-        The number of its first node in the whole mesh.
+        The number of each body's first element in the whole mesh.
     place : callable
         Returns the place of a reference position on a body: ``place(body, at, key)``.
     """
 
     def __init__(
         self, comm: MPI.Comm, solids: Mapping[str, Solid], mesh: LocalMesh, elements: BeamElements, pattern: Pattern,
-        axes: Mapping[str, np.ndarray], first: Mapping[str, int], place: Callable[[str, list[float], str], AxisPlace],
+        first: Mapping[str, int], place: Callable[[str, list[float], str], AxisPlace],
     ) -> None:  # fmt: skip
         self.comm, self._mesh, self._elements, self._pattern = comm, mesh, elements, pattern
-        self._axes, self._first, self._place = axes, first, place
+        self._first, self._place = first, place
         self._stations: list[_Stations] = []
         for body, (name, solid) in enumerate(solids.items()):
             self._collect(body, name, solid)
@@ -142,11 +139,11 @@ class BeamLoads:
                 self._stations.append(self._point(name, load, here))
                 continue
             assert load.where is not None
-            held = located(load.where, self._axes[name], here, {})
-            nodes = self._mesh.natural[self._elements.cells[chosen]] - self._first[name]
-            if not held[axis_mesh(beam)[1]].all(axis=1).any():
-                raise InputError(f"{here}.where: no element of the beam lies there whole; a force at a point has at")
-            self._stations.append(self._spread(chosen[held[nodes].all(axis=1)], load, here))
+            points, cells = axis_mesh(beam)
+            within = located_facets(load.where, points, cells, here, {})
+            # elements are numbered body after body, as they are in the whole mesh
+            number = self._mesh.cell_ids[chosen] - self._first[name]
+            self._stations.append(self._spread(chosen[within[number]], load, here))
 
     def _spread(self, chosen: np.ndarray, load: Load, key: str) -> _Stations:
         """Return the stations of a traction or a pressure on some elements."""
@@ -212,7 +209,7 @@ class BeamLoads:
             self._force += self._product(at.shift)
             if values is not None:
                 cells, pattern = self._elements.cells, self._pattern
-                scatter_matrices(cells, -k * self._tangent, pattern.node_ptr, pattern.slots, values)
+                scatter_matrices(cells, -k * self._tangent, pattern.node_ptr, pattern.slots[0], values)
         b += self._force
 
     def _forces(self, time: float, d: np.ndarray) -> np.ndarray:

@@ -72,15 +72,17 @@ class Timoshenko:
     def __init__(self, length: np.ndarray, axis: np.ndarray, stiffness: np.ndarray):
         self.length, self.axis, self.stiffness = length, axis, stiffness
 
-    def respond(self, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def respond(self, d: np.ndarray, tangent: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return energy, its gradient and its Hessian, of shapes (ne,), (ne, 9) and (ne, 9, 9).
+
+        Without ``tangent`` the Hessian has the shape (0, 9, 9).
 
         Parameters
         ----------
         d : ndarray, shape (ne, 9)
             u_x, u_y (m, along the axes of the plane) and theta (rad) of start, end and middle.
         """
-        return _respond(d, self.length, self.axis, self.stiffness, *_AT_REDUCED)
+        return _respond(d, self.length, self.axis, self.stiffness, *_AT_REDUCED, tangent)
 
     def mass(self, rho_A: np.ndarray, rho_I: np.ndarray) -> np.ndarray:
         """Return the consistent mass matrices, shape (ne, 9, 9): rho A (kg/m) moves, rho I (kg m) turns."""
@@ -108,9 +110,9 @@ _AT_REDUCED = shapes(_REDUCED)
 
 
 @njit(cache=True)
-def _respond(d, length, axis, stiffness, N, slope):
+def _respond(d, length, axis, stiffness, N, slope, tangent):
     n = d.shape[0]
-    W, f, K = np.zeros(n), np.zeros((n, 9)), np.zeros((n, 9, 9))
+    W, f, K = np.zeros(n), np.zeros((n, 9)), np.zeros((n if tangent else 0, 9, 9))
     B = np.zeros((3, 9))
     for e in range(n):
         weight, per_length = length[e] / 2, 2 / length[e]
@@ -136,6 +138,9 @@ def _respond(d, length, axis, stiffness, N, slope):
                 B[2, 3 * a + 2] = dN
             for i in range(9):
                 f[e, i] += force * B[0, i] + shear * B[1, i] + moment * B[2, i]
+            if not tangent:
+                continue
+            for i in range(9):
                 for j in range(9):
                     K[e, i, j] += EA * B[0, i] * B[0, j] + GA * B[1, i] * B[1, j] + EI * B[2, i] * B[2, j]
             # the second variations: of x' and theta, and of theta twice

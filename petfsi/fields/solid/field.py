@@ -163,6 +163,12 @@ class NodalSolid(SolidField):
         self._diagonal = (0.0, 0.0), 1.0
         self._assembled_for = 0.0, 0.0, 0.0, 0.0  # a, k, dt and the mass in row_scale
 
+    @property
+    def rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where this rank's rows of A as last assembled begin, their global columns and values, SI."""
+        rows = self._pattern if self._lumped is None else self._lumped
+        return rows.indptr, rows.indices, self._values
+
     def _set_exchange(self, mesh: SimplexMesh) -> None:
         """Prepare the messages between owned, shared and naturally ordered nodes."""
         comm, nodes = self.comm, self._mesh.nodes
@@ -234,7 +240,8 @@ class NodalSolid(SolidField):
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
         if self._assembled_for != (stage.a, 0.0, dt, mean):
             self._assembled_for = stage.a, 0.0, dt, mean
-            set_csr(self.block, lumped.indptr, lumped.indices, lumped.diagonal(stage.a, mean), new_pattern=False)
+            self._values[:] = lumped.diagonal(stage.a, mean)
+            set_csr(self.block, lumped.indptr, lumped.indices, self._values, new_pattern=False)
             self.n_assembled += 1
         self.row_scale = dt / mean
 
@@ -319,6 +326,11 @@ class NodalSolid(SolidField):
     def _motion(self) -> Motion:
         return Motion(self.displacement, self.velocity, self._past, self._past_dt)
 
+    @property
+    def mean_mass(self) -> float:
+        """What rows are measured against: unless told otherwise the mean nodal mass, kg."""
+        return self._reference_mass
+
     def set_scale(self, reference_mass: float) -> None:
         """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``."""
         self._reference_mass = reference_mass
@@ -346,6 +358,10 @@ class NodalSolid(SolidField):
         if len(placed):
             there = self.comm, self.layout, self._integrator, self._motion()
             self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)
+
+    def along_axes(self, x: np.ndarray) -> np.ndarray:
+        """Return the velocities along the axes, shape (n_owned, dim); a beam's rotations are none."""
+        return x.reshape(-1, self.width)[:, : self.dim]
 
     def _with_shared(self, owned: np.ndarray) -> np.ndarray:
         """Return values at all nodes of this rank's elements. Collective."""
