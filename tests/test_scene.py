@@ -207,7 +207,7 @@ BROKEN = [
     (["time.above_limit=ignore"], 'time.above_limit = "ignore"', "must be 'refuse' or 'subcycle'"),
     (["time.retries=-1"], "time.retries = -1", "must be 0 or more"),
     (["time.retries=21"], "time.retries = 21", "must be 20 or less"),
-    (["time.integrator=static"], 'time.integrator = "static"', "take out the [fluid]"),
+    (["time.integrator=static", "solids.layer.initial={}"], 'time.integrator = "static"', "take out the [fluid]"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
     (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
     (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell' or 'ray'"),
