@@ -136,7 +136,8 @@ class Simulation:
             outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt))
         with self.phase("accept"):
             self._accept(t, dt)
-            petsc.collect_garbage()
+            if len(self.fields) > 1 or not self.stable.limited:  # else no step makes any
+                petsc.collect_garbage()
         self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
 
     def _rewind(self) -> None:
@@ -205,8 +206,7 @@ class Simulation:
 
     def _check_speed(self, solid: SolidField, velocity: np.ndarray, dt: float) -> None:
         """Raise if a node would cross the whole scene in one step: the state has blown up."""
-        along = velocity.reshape(-1, solid.width)[:, : self.scene.dim]  # a beam's rotations are no way to go
-        fastest = self.comm.allreduce(float(np.abs(along).max(initial=0.0)), MPI.MAX)
+        fastest = self.comm.allreduce(float(np.abs(solid.along_axes(velocity)).max(initial=0.0)), MPI.MAX)
         extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
         if self.stable.limited:
             self.stable.moved(fastest * dt)

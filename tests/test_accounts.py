@@ -165,6 +165,19 @@ def test_what_followers_and_timed_loads_do_is_entered_as_the_step_uses_it():
     assert np.abs(got["energy_residual"]).max() < 1e-11 * np.abs(got["load_work"]).max()
 
 
+@pytest.mark.parallel([1, 2])
+def test_loads_on_a_wet_solid_are_entered():
+    """A layer between waters that are open above and below, loaded on both faces, all at small amplitude."""
+    sides = [{"where": side, "fix": ["x"]} for side in ("left", "right")]
+    top = {"where": "top", "traction": [0.0, "0.1*sin(20*t)*cos(pi*x)"]}
+    loads = [top, {"where": "bottom", "pressure": "0.05*sin(9*t)"}]
+    block = solid([0.0, 0.23], [1.0, 0.2], [4, 3], supports=sides, loads=loads)
+    water = fluid((4, 16), sides={"top": "open", "bottom": "open"})
+    got = history(scene("midpoint", fluid=water, solids={"block": block}), 40)
+    assert np.abs(got["load_work"]).max() > 1e-8
+    assert np.abs(got["energy_residual"]).max() < 1e-5 * np.abs(got["load_work"]).max()
+
+
 def test_a_force_pays_for_what_it_throws():
     block = solid([0.0, 0.0], [0.3, 0.2], [3, 2], body_force=["600*t", 0.0])
     got = history(scene("midpoint", dt=0.01, solids={"block": block}), 10)

@@ -1,55 +1,23 @@
-"""Loads on solids: resultants, what turns and what does not, tangents, tags, and an inflated cylinder."""
+"""Loads on solids: resultants, what turns and what does not, tangents, and what is refused."""
 
 from math import factorial
 
-import meshio
 import numpy as np
 import pytest
+from load_cases import COMM, ORDERS, SIZE, forces, loaded, resultant
 from mpi4py import MPI
-from petsc4py import PETSc
-from solid_cases import body, field, gathered, step, wave
+from solid_cases import wave
 
 from petfsi.errors import InputError
-from petfsi.fields.solid import SimplexSolid
-from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.loads.rules import simplex_rule
 from petfsi.fields.solid.rules import shape_functions, shape_slopes
-from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.surfaces import boundary_facets
-from petfsi.integrators import Stage
-from petfsi.scene.load import scene_from_dict
-from petfsi.scene.schema import Box
-
-COMM = MPI.COMM_WORLD
-SIZE = np.array([1.5, 1.0, 0.8])
-ORDERS = pytest.mark.parametrize("elements", ["linear", "quadratic"])
 
 
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])
 def dim(request):
     return request.param
-
-
-def loaded(dim, comm=COMM, **more):
-    return field(dim, comm, b=body(dim, **more))
-
-
-def forces(solid, time=0.0, move=None, shift=None, k=0.0, values=None):
-    """Return this rank's rows of the loads' forces where nodes have moved by ``move``, a function of positions."""
-    x = solid._mesh.points
-    zero = np.zeros_like(x)
-    d = zero if move is None else move(x)
-    b = np.zeros_like(solid.reference)
-    solid._loads.assemble(time, State(d, zero, zero if shift is None else shift(x)), k, values, b)
-    return b
-
-
-def resultant(solid, **how):
-    """Return the sum of all nodal forces and of their moments about the origin, at rest."""
-    f, x = forces(solid, **how), solid.reference
-    moments = [x[:, a] @ f[:, b] - x[:, b] @ f[:, a] for a, b in ((0, 1), (1, 2), (2, 0))[: 1 if solid.dim == 2 else 3]]
-    return COMM.allreduce(np.concatenate((f.sum(axis=0), moments)))
 
 
 # ---- rules --------------------------------------------------------------------------------------------------
@@ -276,128 +244,7 @@ def test_a_uniform_traction_loads_the_middles_of_quadratic_facets(dim):
     assert f.sum() == pytest.approx(6.0 if dim == 2 else 4.8, rel=1e-12)
 
 
-# ---- prescribed displacements -------------------------------------------------------------------------------
-
-WAY = {"x": "0.05*sin(4*t + y)", "y": "0.02*t*x"}
-
-
-@pytest.mark.parallel([1, 2])
-@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
-def test_a_prescribed_displacement_is_met_at_the_end_of_every_step(integrator, dim):
-    push = [{"where": "right", "fix": ["x", "y"], "displacement": WAY}, {"where": "left", "fix": ["x"]}]
-    solid = field(dim, COMM, integrator=integrator, b=body(dim, supports=push))
-    points = gathered(solid, "points")
-    right, left = np.isclose(points[:, 0], 1.5), np.isclose(points[:, 0], 0.0)
-
-    def wanted(t):
-        x, y = points[right, 0], points[right, 1]
-        return np.column_stack((0.05 * np.sin(4 * t + y), 0.02 * t * x))
-
-    def check(t):
-        d = gathered(solid, "displacement")
-        np.testing.assert_allclose(d[right, :2], wanted(t), atol=1e-15)
-        np.testing.assert_allclose(d[left, 0], 0.0, atol=1e-15)
-
-    check(0.0)
-    u = gathered(solid, "velocity")[right, :2]
-    y = points[right, 1]
-    np.testing.assert_allclose(u, np.column_stack((0.2 * np.cos(y), 0.03 + 0 * y)), atol=1e-7)
-    t = 0.0
-    for h in (0.1, 0.1, 0.07, 0.13):
-        step(solid, t, h)
-        t += h
-        check(t)
-
-
-def test_the_later_support_decides_between_velocity_and_displacement():
-    both = [
-        {"where": "all", "fix": ["x", "y"], "velocity": {"x": 1.0}},
-        {"where": "right", "fix": ["x"], "displacement": {"x": "t*t"}},
-    ]
-    solid = field(2, MPI.COMM_SELF, integrator="bdf2", b=body(2, supports=both))
-    for n in range(3):
-        step(solid, 0.1 * n, 0.1)
-    d, x = gathered(solid, "displacement"), gathered(solid, "points")
-    right = np.isclose(x[:, 0], 1.5)
-    np.testing.assert_allclose(d[right, 0], 0.09, atol=1e-15)
-    np.testing.assert_allclose(d[~right, 0], 0.3, rtol=1e-12)
-
-
-def test_an_unknown_follows_the_prescribed_displacement_at_second_order():
-    """The end of a bar whose other end is moved, with the same way prescribed as velocity: both orders are 2."""
-
-    def tip(supports, n):
-        solid = field(2, MPI.COMM_SELF, integrator="bdf2", b=body(2, (4, 1), size=(1.5, 0.3), supports=supports))
-        for k in range(n):
-            step(solid, 0.4 / n * k, 0.4 / n)
-        x = gathered(solid, "points")
-        return gathered(solid, "displacement")[np.isclose(x[:, 0], 1.5), 0].mean()
-
-    rails = {"where": "bottom", "fix": ["y"]}
-    way = [{"where": "left", "fix": ["x"], "displacement": {"x": "0.02*sin(3*t)**2"}}, rails]
-    speed = [{"where": "left", "fix": ["x"], "velocity": {"x": "0.06*sin(6*t)"}}, rails]
-    exact = tip(way, 640)
-    for supports in (way, speed):
-        error = [abs(tip(supports, n) - exact) for n in (20, 40)]
-        assert np.log2(error[0] / error[1]) == pytest.approx(2.0, abs=0.25), (supports, error)
-
-
-# ---- tags ---------------------------------------------------------------------------------------------------
-
-
-def annulus(path, n_along, n_around):
-    """Write a quarter of a ring, radii 1 to 1.2, with its inner arc and both cuts tagged."""
-    box = Box(origin=[0, 0], size=[1, 1], cells=[n_along, n_around])
-    s, cells = box_mesh(box)
-    radius, angle = 1 + 0.2 * s[:, 0], np.pi / 2 * s[:, 1]
-    points = np.column_stack((radius * np.cos(angle), radius * np.sin(angle)))
-    facets = boundary_facets(s, cells)
-    lines = {1: (0, 0.0), 2: (1, 0.0), 3: (1, 1.0)}
-    chosen = {tag: facets[np.isclose(s[facets][:, :, axis], end).all(axis=1)] for tag, (axis, end) in lines.items()}
-    # a point that belongs to no cell comes first: numbers shift when it is dropped
-    points = np.vstack(([[9.0, 9.0]], points))
-    blocks = [("triangle", cells + 1), *(("line", some + 1) for some in chosen.values())]
-    physical = [np.full(len(cells), 7), *(np.full(len(some), tag) for tag, some in chosen.items())]
-    mesh = meshio.Mesh(
-        np.column_stack((points, np.zeros(len(points)))), blocks,
-        cell_data={"gmsh:physical": physical, "gmsh:geometrical": physical},
-        field_data={"inner": np.array([1, 1]), "floor": np.array([2, 1]), "body": np.array([7, 2])},
-    )  # fmt: skip
-    if COMM.rank == 0:
-        mesh.write(path, file_format="gmsh22", binary=False)
-    COMM.barrier()
-
-
-def ring(path, lame=1.5, **more):
-    young, poisson = (3 * lame + 2) / (lame + 1), lame / (2 * (lame + 1))
-    supports = [{"where": {"tag": "floor"}, "fix": ["y"]}, {"where": {"tag": "3"}, "fix": ["x"]}]
-    solid = {"shape": {"mesh": str(path)}, "density": 1.0, "young": young, "poisson": poisson, "supports": supports}
-    return {"dim": 2, "time": {"end": 1.0, "dt": 0.1}, "solids": {"ring": solid | more}}
-
-
-@pytest.fixture
-def shared_path(tmp_path):
-    return COMM.bcast(tmp_path)
-
-
-@pytest.mark.parallel([1, 3])
-@ORDERS
-def test_tags_of_a_mesh_file_pick_facets_and_nodes(shared_path, elements):
-    annulus(shared_path / "ring.msh", 2, 8)
-    load = {"where": {"tag": "inner"}, "pressure": 2.0}
-    solid = SimplexSolid(COMM, scene_from_dict(ring(shared_path / "ring.msh", elements=elements, loads=[load])))
-    np.testing.assert_allclose(resultant(solid)[:2], [2.0, 2.0], rtol=1e-12)
-    assert len(solid._supports.unknowns) == {"linear": 6, "quadratic": 10}[elements]
-
-
-@pytest.mark.parallel([1, 2])
-@pytest.mark.parametrize("where", ["loads", "supports"])
-def test_an_unknown_tag_is_named_with_those_that_the_file_has(shared_path, where):
-    annulus(shared_path / "ring.msh", 1, 4)
-    item = {"loads": {"pressure": 1.0}, "supports": {"fix": ["x"]}}[where] | {"where": {"tag": "iner"}}
-    data = ring(shared_path / "ring.msh", **{where: [item]})
-    with pytest.raises(InputError, match=rf"solids.ring.{where}.0.where.tag = 'iner'.*it has 3, floor, inner$"):
-        SimplexSolid(COMM, scene_from_dict(data))
+# ---- what is refused ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parallel([1, 2])
@@ -419,53 +266,3 @@ def test_an_expression_that_blows_up_is_named_on_every_rank(dim):
         forces(solid, time=0.5)
     with pytest.raises(InputError, match="solids.b.loads.0.traction.1"):
         loaded(dim, loads=[{"where": "left", "traction": [0.0, "log(y - 0.5)", 0.0][:dim]}])
-
-
-# ---- statics ------------------------------------------------------------------------------------------------
-
-
-def newton(solid, most=25, tolerance=1e-12):
-    """Bring a solid into equilibrium; return the norms of the residuals on the way."""
-    norms = []
-    ksp = PETSc.KSP().create(solid.comm)
-    ksp.setType("preonly")
-    ksp.getPC().setType("lu")
-    ksp.getPC().setFactorSolverType("mumps")
-    x, b = solid.block.createVecs()
-    while len(norms) < most and (not norms or norms[-1] > tolerance):
-        zero = np.zeros_like(solid.displacement)
-        solid._stage = Stage(a=0.0, k=1.0, inertia=zero, tangent_at=solid.displacement, shift=zero)
-        solid.assemble(0.0, 1.0)
-        b.setArray(solid.rhs)
-        norms.append(b.norm())
-        ksp.setOperators(solid.block)
-        ksp.solve(b, x)
-        solid.displacement = solid.displacement + x.getArray().reshape(-1, solid.dim)
-    for thing in (ksp, x, b):
-        thing.destroy()
-    return norms
-
-
-def inflate(path, n, pressure, elements="linear"):
-    """Return the stretch of the inner radius and the residuals of Newton's iterations."""
-    annulus(path, n, 8 * n)
-    load = {"where": {"tag": "inner"}, "pressure": pressure}
-    solid = SimplexSolid(COMM, scene_from_dict(ring(path, material="neohookean", elements=elements, loads=[load])))
-    norms = newton(solid)
-    X, d = gathered(solid, "points"), gathered(solid, "displacement")
-    inner = np.isclose(np.linalg.norm(X, axis=1), 1.0)
-    return np.linalg.norm(X + d, axis=1)[inner].mean(), norms
-
-
-@pytest.mark.parallel([1, 2])
-def test_a_thick_cylinder_inflates_as_derived_and_newton_converges_quadratically(shared_path):
-    table = np.genfromtxt("tests/data/cylinder_inflation_planestrain.csv", delimiter=",", comments="#", skip_header=4)
-    for _, stretch, pressure, _ in table[:4]:
-        found = [inflate(shared_path / f"{n}.msh", n, pressure) for n in (2, 4)]
-        errors = [abs(a - stretch) for a, _ in found]
-        assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.25), (stretch, errors)
-        norms = np.array(found[1][1])
-        assert norms[-1] < 1e-12, norms
-        late = norms[(norms < 1e-2) & (norms > 1e-7)]
-        assert len(norms) <= 12 and np.all(norms[np.flatnonzero(np.isin(norms, late)) + 1] < 100 * late**1.8), norms
-    assert errors[1] < 0.005 * stretch

@@ -178,6 +178,16 @@ BROKEN = [
         'material = "jelly"',
         "must be 'green', 'neohookean', 'stable-neohookean' or 'linear'",
     ),
+    (
+        ["solids.layer.elements=cubic"],
+        'elements = "cubic"',
+        "must be 'linear' or 'quadratic' (order of the shape functions)",
+    ),
+    (
+        ["solids.layer.volumetric=half"],
+        'volumetric = "half"',
+        "must be 'full' or 'reduced' (integration of lambda's part; reduced does not lock)",
+    ),
     (["solids.layer.tangent=soft"], 'tangent = "soft"', "must be 'exact' or 'projected' (projected: without"),
     (["solids.layer.interior=air"], 'interior = "air"', "must be 'fluid' or 'void'"),
     (["solids.layer.supports.0.fix=[]"], "solids.layer.supports.0.fix = []", "must not be empty"),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
@@ -103,8 +102,6 @@ class Field(ABC):
         How often the block was assembled.
     pattern_version : int
         Grows whenever the pattern of the block changes; the same on all ranks.
-    statics : mapping of str to str
-        PETSc options that suit Newton's method where there is no inertia, unless others are given.
     """
 
     name: str
@@ -115,7 +112,6 @@ class Field(ABC):
     col_scale: float = 1.0
     n_assembled: int = 0
     pattern_version: int = 0
-    statics: ClassVar[Mapping[str, str]] = {"snes_linesearch_type": "l2"}
 
     @abstractmethod
     def unknown(self) -> np.ndarray:
@@ -233,8 +229,6 @@ class SolidField(Field):
 
     Attributes
     ----------
-    width : int
-        Unknowns a node; the first ones are velocities along the axes.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
@@ -247,7 +241,6 @@ class SolidField(Field):
         Whether its tangent never changes, and neither does the stable step.
     """
 
-    width: int
     extent: float
     moved: np.ndarray
     finest: float
@@ -257,6 +250,14 @@ class SolidField(Field):
     @abstractmethod
     def stable_step(self) -> float:
         """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
+
+    @abstractmethod
+    def stretch(self) -> float:
+        """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
+
+    @abstractmethod
+    def along_axes(self, x: np.ndarray) -> np.ndarray:
+        """Return the velocities along the axes of this rank's nodes from unknowns x (SI), shape (n, dim)."""
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:

@@ -41,21 +41,10 @@ def beam_shape(key: str, beam: Beam, dim: int) -> Problems:
 
 
 def beams(scene: Scene) -> Problems:
-    """Judge what beams need of other settings, and of each other."""
-    theories = {name: solid.shape.beam.theory for name, solid in scene.solids.items() if solid.shape.beam is not None}
-    for name in theories:
-        yield from _settings(f"solids.{name}", scene.solids[name])
-    if not theories:
-        return
-    first = next(iter(theories))
-    others = [name for name in scene.solids if name not in theories]
-    if others:
-        allowed = f"a scene has beams or other solids, not both; solids.{others[0]} is none"
-        yield Problem(f"solids.{first}.shape.beam", ABSENT, allowed, (f"solids.{others[0]}.shape",))
-    for name, theory in theories.items():
-        if theory != theories[first]:
-            allowed = f"must be that of solids.{first}, {theories[first]}: all beams of a scene have one theory"
-            yield Problem(f"solids.{name}.shape.beam.theory", theory, allowed, (f"solids.{first}.shape.beam.theory",))
+    """Judge what beams need of other settings."""
+    for name, solid in scene.solids.items():
+        if solid.shape.beam is not None:
+            yield from _settings(f"solids.{name}", solid)
 
 
 def _settings(key: str, solid: Solid) -> Problems:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
@@ -41,10 +40,6 @@ class BeamSolid(NodalSolid):
     z from the axis are at x + z n, n = (-sin phi, cos phi), and move with x' - z phi' (cos phi, sin phi). The surface
     is the outline of the strip: both faces, z = -h/2 and h/2, with a point at every node, and both ends.
     """
-
-    #: A thin beam bends along a narrow valley of its energy, out of which every full step leads: the residual, mostly
-    #: that of the axis' stretch, grows by EA L^2/EI and falls again in the next iteration.
-    statics: ClassVar[Mapping[str, str]] = {"snes_linesearch_type": "basic", "snes_divergence_tolerance": "1e12"}
 
     _elements: BeamElements
 

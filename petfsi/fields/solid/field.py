@@ -163,6 +163,12 @@ class NodalSolid(SolidField):
         self._diagonal = (0.0, 0.0), 1.0
         self._assembled_for = 0.0, 0.0, 0.0, 0.0  # a, k, dt and the mass in row_scale
 
+    @property
+    def rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where this rank's rows of A as last assembled begin, their global columns and values, SI."""
+        rows = self._pattern if self._lumped is None else self._lumped
+        return rows.indptr, rows.indices, self._values
+
     def _set_exchange(self, mesh: SimplexMesh) -> None:
         """Prepare the messages between owned, shared and naturally ordered nodes."""
         comm, nodes = self.comm, self._mesh.nodes
@@ -218,10 +224,10 @@ class NodalSolid(SolidField):
         if lag is not None:
             stage = replace(stage, shift=lag)
         # most explicit steps send one array only
-        sent = (stage.tangent_at,) if lag is None else (stage.tangent_at, stage.shift)
-        d, *lags = np.split(self._with_shared(np.concatenate(sent, axis=1)), len(sent), axis=1)
-        rest = np.zeros_like(d)
-        state = State(d, rest, lags[0] if lags else rest)
+        sent = stage.tangent_at if lag is None else np.concatenate((stage.tangent_at, stage.shift), axis=1)
+        local = self._with_shared(sent)
+        rest = np.zeros((len(local), self.width))
+        state = State(local[:, : self.width], rest, rest if lag is None else local[:, self.width :])
         b = self.rhs.reshape(-1, self.width)
         self._elements.forces(state, b)
         b += lumped.mass * stage.inertia
@@ -234,7 +240,8 @@ class NodalSolid(SolidField):
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
         if self._assembled_for != (stage.a, 0.0, dt, mean):
             self._assembled_for = stage.a, 0.0, dt, mean
-            set_csr(self.block, lumped.indptr, lumped.indices, lumped.diagonal(stage.a, mean), new_pattern=False)
+            self._values[:] = lumped.diagonal(stage.a, mean)
+            set_csr(self.block, lumped.indptr, lumped.indices, self._values, new_pattern=False)
             self.n_assembled += 1
         self.row_scale = dt / mean
 
@@ -275,7 +282,7 @@ class NodalSolid(SolidField):
         """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
         if self._lumped is None:
             return np.inf
-        d = self._with_shared(self.displacement)
+        d = self._measured = self._with_shared(self.displacement)
         rest, free = np.zeros_like(d), ~self._is_held[: self._mesh.n_owned]
         here, there = np.empty_like(self.displacement), np.empty_like(self.displacement)
         self._elements.forces(State(d, rest, rest), here)
@@ -290,6 +297,22 @@ class NodalSolid(SolidField):
         eigenvalue = largest_eigenvalue(self.comm, stiffness, self._lumped.mass, start)
         return stable_step(eigenvalue, float(self._damping[:, 1].max()))
 
+    def stretch(self) -> float:
+        """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
+        start, end, length = self._edges
+        change = self._with_shared(self.displacement) - self._measured
+        change = np.abs(change[end] - change[start])
+        change[:, : self.dim] /= length[:, None]
+        return self.comm.allreduce(float(change.max(initial=0.0)), MPI.MAX)
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both ends of every pair of nodes of this rank's elements, and their distance at rest, m."""
+        a, b = np.triu_indices(self._mesh.cells.shape[1], 1)
+        pairs = self._mesh.cells[:, np.stack((a, b), axis=1)].reshape(-1, 2)
+        start, end = np.unique(np.sort(pairs, axis=1), axis=0).T
+        return start, end, np.linalg.norm(self._mesh.points[end] - self._mesh.points[start], axis=1)
+
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the velocities w and move the nodes."""
         w, motion = x.reshape(-1, self.width).copy(), self._motion()
@@ -302,6 +325,11 @@ class NodalSolid(SolidField):
 
     def _motion(self) -> Motion:
         return Motion(self.displacement, self.velocity, self._past, self._past_dt)
+
+    @property
+    def mean_mass(self) -> float:
+        """What rows are measured against: unless told otherwise the mean nodal mass, kg."""
+        return self._reference_mass
 
     def set_scale(self, reference_mass: float) -> None:
         """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``."""
@@ -321,11 +349,19 @@ class NodalSolid(SolidField):
         return diagonal
 
     def _prescribe(self, stage: Stage, time: float, dt: float) -> None:
-        instants, placed = self._integrator.instants(dt), self._supports.placed
-        self._prescribed = np.mean([self._supports.velocities(time + t).copy() for t in instants], axis=0)
+        first, *others = self._integrator.instants(dt)
+        placed = self._supports.placed
+        self._prescribed = self._supports.velocities(time + first).copy()
+        if others:
+            every = [self._prescribed, *(self._supports.velocities(time + t).copy() for t in others)]
+            self._prescribed = np.mean(every, axis=0)
         if len(placed):
             there = self.comm, self.layout, self._integrator, self._motion()
             self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)
+
+    def along_axes(self, x: np.ndarray) -> np.ndarray:
+        """Return the velocities along the axes, shape (n_owned, dim); a beam's rotations are none."""
+        return x.reshape(-1, self.width)[:, : self.dim]
 
     def _with_shared(self, owned: np.ndarray) -> np.ndarray:
         """Return values at all nodes of this rank's elements. Collective."""

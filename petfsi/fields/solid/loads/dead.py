@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from petfsi.fields.solid.loads.simplices import Coordinates, Simplices
 from petfsi.scene.expressions import Expression
@@ -26,7 +27,7 @@ class DeadLoads:
         self._n, self._dim = n_rows, dim
         self._constant = np.zeros((n_rows, dim))
         self._timed: list[tuple[Expression, Coordinates, np.ndarray]] = []
-        self._placed: list = []
+        self._placed: list[tuple[Expression, Coordinates, csr_matrix, np.ndarray]] = []
 
     @property
     def depends_on_time(self) -> bool:
@@ -48,15 +49,13 @@ class DeadLoads:
             N/m^3 or N/m^2; directions of shape (dim,) or (n, q, dim).
         """
         spread, coordinates = on.spread(self._n), on.coordinates
-        shape = (*on.weights.shape, self._dim)
         for expression, direction in terms:
-            along = np.broadcast_to(direction, shape).reshape(-1, self._dim)
             if not expression.names - {"t"}:
-                self._add_timed(expression, coordinates, spread @ along)
+                self._add_timed(expression, coordinates, _spread(spread, np.ones(spread.shape[1]), direction))
             elif expression.depends_on_time:
-                self._placed.append((expression, coordinates, spread, along))
+                self._placed.append((expression, coordinates, spread, direction))
             else:
-                self._constant += spread @ (expression(**coordinates).reshape(-1, 1) * along)
+                self._constant += _spread(spread, expression(**coordinates), direction)
 
     def add_point(
         self, components: Sequence[Expression], at: Coordinates, rows: np.ndarray, weights: np.ndarray
@@ -83,6 +82,13 @@ class DeadLoads:
         for expression, at, unit in self._timed:
             here = {name: value for name, value in at.items() if name in expression.names}
             total += float(expression(t=time, **here)) * unit
-        for expression, coordinates, spread, along in self._placed:
-            total += spread @ (expression(t=time, **coordinates).reshape(-1, 1) * along)
+        for expression, coordinates, spread, direction in self._placed:
+            total += _spread(spread, expression(t=time, **coordinates), direction)
         return total
+
+
+def _spread(spread: csr_matrix, density: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return the nodal forces of densities at all points along one direction, or each along its own."""
+    if direction.ndim == 1:
+        return np.outer(spread @ density.ravel(), direction)
+    return spread @ (density.reshape(-1, 1) * direction.reshape(-1, direction.shape[-1]))

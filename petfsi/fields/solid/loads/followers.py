@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from petfsi.fields.solid.loads.simplices import Simplices
 from petfsi.scene.expressions import Expression
-
-_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-_CROSS = np.zeros((3, 3, 3))
-_CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
-_CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 
 
 class FollowerPressure:
@@ -48,15 +44,13 @@ class FollowerPressure:
         """
         f = self.facets
         p = f.rule * self._pressure(t=time, **self._coordinates)
+        n, m = f.nodes.shape
+        K = np.zeros((n, m, f.dim, m, f.dim))
         if f.dim == 2:
-            K = -np.einsum("eq,qa,qb,ij->eaibj", p, f.values, f.slopes[:, :, 0], _TURN, optimize=True)
+            _tangents_2d(p, f.values, f.slopes, K)
         else:
-            t = f.tangents(x)
-            lever = np.einsum("qb,eqk->eqbk", f.slopes[:, :, 0], t[..., 1])
-            lever -= np.einsum("qb,eqk->eqbk", f.slopes[:, :, 1], t[..., 0])
-            arm = np.einsum("eq,qa,eqbk->eabk", p, f.values, lever, optimize=True)
-            K = -np.einsum("eabk,ijk->eaibj", arm, _CROSS)
-        return (K + K.transpose(0, 3, 4, 1, 2)) / 2
+            _tangents_3d(f.nodes, x, p, f.values, f.slopes, K)
+        return K
 
 
 class FollowerTraction:
@@ -102,6 +96,50 @@ class FollowerTraction:
         U = (C + area * np.eye(2)) / np.sqrt(trace + 2 * area)
         R = F @ np.linalg.inv(U)
         return np.concatenate((R, np.cross(R[..., 0], R[..., 1])[..., None]), axis=-1)
+
+
+@njit(cache=True)
+def _tangents_2d(p, values, slopes, K):
+    """Add half of -p N_a N_b,1 Q, Q the turn by -90 degrees, and half of its transpose."""
+    for e in range(p.shape[0]):
+        for q in range(p.shape[1]):
+            for a in range(values.shape[1]):
+                for b in range(values.shape[1]):
+                    half = 0.5 * p[e, q] * values[q, a] * slopes[q, b, 0]
+                    K[e, a, 0, b, 1] -= half
+                    K[e, a, 1, b, 0] += half
+                    K[e, b, 1, a, 0] -= half
+                    K[e, b, 0, a, 1] += half
+
+
+@njit(cache=True)
+def _tangents_3d(nodes, x, p, values, slopes, K):
+    """Add half of -p N_a (L_b x), L_b = N_b,1 x,2 - N_b,2 x,1 and (L x)_ij = eps_ijk L_k, and half of its transpose."""
+    n = values.shape[1]
+    t, L, arm = np.empty((2, 3)), np.empty((n, 3)), np.empty((n, n, 3))
+    for e in range(p.shape[0]):
+        arm[:] = 0.0
+        for q in range(p.shape[1]):
+            t[:] = 0.0
+            for a in range(n):
+                for i in range(3):
+                    t[0, i] += slopes[q, a, 0] * x[nodes[e, a], i]
+                    t[1, i] += slopes[q, a, 1] * x[nodes[e, a], i]
+            for b in range(n):
+                for i in range(3):
+                    L[b, i] = slopes[q, b, 0] * t[1, i] - slopes[q, b, 1] * t[0, i]
+            for a in range(n):
+                for b in range(n):
+                    for i in range(3):
+                        arm[a, b, i] += 0.5 * p[e, q] * values[q, a] * L[b, i]
+        for a in range(n):
+            for b in range(n):
+                for k in range(3):
+                    i, j = (k + 1) % 3, (k + 2) % 3
+                    # of the pair of rows a, b and its mirror image
+                    difference = arm[a, b, k] - arm[b, a, k]
+                    K[e, a, i, b, j] -= difference
+                    K[e, a, j, b, i] += difference
 
 
 def _orthonormal(tangents: np.ndarray) -> np.ndarray:

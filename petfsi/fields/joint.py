@@ -1,0 +1,330 @@
+"""Solids of several kinds in one scene as a single field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_matrix, vstack
+
+from petfsi.errors import InputError
+from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work
+from petfsi.fields.solid.field import NodalSolid
+from petfsi.fields.solid.partition import Fetch, slab
+from petfsi.geometry.bodies import build_bodies
+from petfsi.geometry.surfaces import Surface
+from petfsi.petsc import IntType, Layout, new_block, set_csr
+from petfsi.ranks import on_root
+from petfsi.scene.schema import Scene
+
+
+class JointSolid(SolidField):
+    """Fields of one kind of solid each, seen as one.
+
+    A rank holds its unknowns part after part, so that each part's rows of the block are contiguous and the block,
+    A = diag(A_1, A_2, ...) up to the order of the unknowns, is the parts' values one after the other. What the parts
+    give by their own global numbers is renumbered rank by rank. Kinds do not feel each other but through a fluid.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    scene : Scene
+    kinds : mapping of str to str
+        The kind of each body.
+    fields : mapping of str to callable
+        What makes the field of a kind from ranks and a scene; its key begins the names of the part's state.
+
+    Attributes
+    ----------
+    names : list of str
+        All bodies, in the order of the scene.
+    kinds : list of str
+    parts : list of NodalSolid
+        Of each kind.
+    """
+
+    name = "solid"
+
+    def __init__(
+        self, comm: MPI.Comm, scene: Scene, kinds: Mapping[str, str],
+        fields: Mapping[str, Callable[[MPI.Comm, Scene], NodalSolid]],
+    ) -> None:  # fmt: skip
+        self.comm = comm
+        self.names, self.kinds = list(scene.solids), list(fields)
+        self.parts: list[NodalSolid] = []
+        on_root(comm, lambda: build_bodies(scene) and None)  # a part cannot tell whether its bodies overlap another's
+        for kind, make in fields.items():
+            own = {name: solid for name, solid in scene.solids.items() if kinds[name] == kind}
+            self.parts.append(make(comm, scene.model_copy(update={"solids": own})))
+        self.explicit = self.parts[0].explicit
+        self.is_linear = all(part.is_linear for part in self.parts)
+        self.finest = min(part.finest for part in self.parts)
+        self.extent = self._largest_side()
+        counts = [part.layout.n_local for part in self.parts]
+        ends = np.cumsum(counts)
+        self._pieces = [slice(end - n, end) for end, n in zip(ends, counts, strict=True)]
+        self.layout = Layout.of(comm, int(ends[-1]))
+        self._number = _stacked_numbers(comm, counts)
+        self.rhs = np.zeros(self.layout.n_local)
+        self.moved = np.zeros(self.layout.n_local)
+        self._set_block()
+        nodes = [part.layout.n_global // part.width for part in self.parts]
+        self.set_scale(float(np.average([part.mean_mass for part in self.parts], weights=nodes)))
+        self._surface: Surface | None = None
+        self._surfaces: list[Surface] = []
+        self._static: dict[str, Slab] = {}
+
+    def _largest_side(self) -> float:
+        """Return the largest side of the bounding box of all bodies at rest, m. Collective."""
+        x = np.concatenate([part.reference for part in self.parts])
+        ends = np.stack((x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)))
+        return float(self.comm.allreduce(ends, MPI.MAX).sum(axis=0).max())
+
+    def _set_block(self) -> None:
+        rows = [part.rows for part in self.parts]
+        sizes = [len(values) for _, _, values in rows]
+        starts = np.concatenate(([0], np.cumsum(sizes)))
+        self._entries = [slice(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+        indptr = [ptr[1:] + start for (ptr, _, _), start in zip(rows, starts, strict=False)]
+        self._indptr = np.concatenate(([0], *indptr)).astype(IntType)
+        # numbers keep their order, so columns stay sorted
+        self._indices = np.concatenate([n[columns] for n, (_, columns, _) in zip(self._number, rows, strict=True)])
+        self._values = np.zeros(starts[-1])
+        self.block = new_block(self.comm, self.layout, self.layout)
+        set_csr(self.block, self._indptr, self._indices, self._values, new_pattern=True)
+        self._assembled = [0] * len(self.parts)
+        vectors = []
+        for modes in zip(*(part.near_null_space() for part in self.parts), strict=True):
+            vectors.append(self.block.createVecRight())
+            vectors[-1].setArray(np.concatenate(modes))
+        self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
+
+    def _split(self, x: np.ndarray) -> list[tuple[NodalSolid, np.ndarray]]:
+        return [(part, x[piece]) for part, piece in zip(self.parts, self._pieces, strict=True)]
+
+    # ---- the step ---------------------------------------------------------------------------------------------
+
+    def unknown(self) -> np.ndarray:
+        """Return the velocities of the step last accepted."""
+        return np.concatenate([part.unknown() for part in self.parts])
+
+    def predict(self, time: float, dt: float) -> None:
+        """Begin the step in every part."""
+        for part in self.parts:
+            part.predict(time, dt)
+
+    def assemble(self, time: float, dt: float) -> None:
+        """Refresh block (only if that of a part has changed) and right-hand side. Collective."""
+        for part in self.parts:
+            part.assemble(time, dt)
+        self.rhs[:] = np.concatenate([part.rhs for part in self.parts])
+        self.row_scale = self.parts[0].row_scale
+        assembled = [part.n_assembled for part in self.parts]
+        if assembled == self._assembled:
+            return
+        for n, part in enumerate(self.parts):
+            if assembled[n] != self._assembled[n]:
+                self._values[self._entries[n]] = part.rows[2]
+        # all of it: whoever solves has scaled the block in place
+        set_csr(self.block, self._indptr, self._indices, self._values, new_pattern=False)
+        self._assembled = assembled
+        self.n_assembled += 1
+
+    def accept(self, x: np.ndarray, time: float, dt: float) -> None:
+        """Give every part its velocities."""
+        for part, mine in self._split(x):
+            part.accept(mine, time, dt)
+        self.moved = np.concatenate([part.moved for part in self.parts])
+
+    def rewind(self) -> None:
+        """Forget the step begun, in every part."""
+        for part in self.parts:
+            part.rewind()
+
+    def linearised_at(self) -> np.ndarray:
+        """Return where every part's block is the derivative."""
+        return np.concatenate([part.linearised_at() for part in self.parts])
+
+    def relinearise(self, x: np.ndarray) -> bool:
+        """Let every part linearise about x; return whether that changes any."""
+        return sum([part.relinearise(mine) for part, mine in self._split(x)]) > 0  # not any(): every part must hear
+
+    def round_off(self, x: np.ndarray) -> float:
+        """Return the sum of the parts' round-off. Collective."""
+        # parts' own blocks are not scaled
+        return self.row_scale * sum(part.round_off(mine) for part, mine in self._split(x))
+
+    def set_scale(self, reference_mass: float) -> None:
+        """Measure the rows of all parts against this mass, kg."""
+        for part in self.parts:
+            part.set_scale(reference_mass)
+
+    def stable_step(self) -> float:
+        """Return the shortest of the parts' stable steps, s. Collective."""
+        return min(part.stable_step() for part in self.parts)
+
+    def stretch(self) -> float:
+        """Return the largest relative change of an edge of any part since the last ``stable_step``. Collective."""
+        return max(part.stretch() for part in self.parts)
+
+    def along_axes(self, x: np.ndarray) -> np.ndarray:
+        """Return the velocities along the axes of all nodes, shape (n_owned, dim)."""
+        return np.concatenate([part.along_axes(mine) for part, mine in self._split(x)])
+
+    def light_motions(self, degree: int, density: float, most: int) -> np.ndarray:
+        """Return polynomial motions of each light body of every part, shape (n, layout.n_local). Collective."""
+        for lower in range(degree, -1, -1):
+            motions = [part.light_motions(lower, density, most) for part in self.parts]
+            if sum(map(len, motions)) <= most:
+                break
+        else:
+            return np.zeros((0, self.layout.n_local))
+        rows = np.cumsum([0, *map(len, motions)])
+        whole = np.zeros((rows[-1], self.layout.n_local))
+        for n, piece in enumerate(self._pieces):
+            whole[rows[n] : rows[n + 1], piece] = motions[n]
+        return whole
+
+    # ---- the surface ------------------------------------------------------------------------------------------
+
+    def surface(self) -> Surface:
+        """Return the surfaces of all parts as one; another object when that of a part is another. Collective."""
+        surfaces = [part.surface() for part in self.parts]
+        known = zip(surfaces, self._surfaces, strict=False)
+        if self._surface is None or any(new is not old for new, old in known):
+            self._surfaces, self._surface = surfaces, self._joined(surfaces)
+        return self._surface
+
+    def _joined(self, surfaces: list[Surface]) -> Surface:
+        first = np.cumsum([0] + [surface.n_points for surface in surfaces])
+        return Surface(
+            facets=np.concatenate([s.facets + n for s, n in zip(surfaces, first, strict=False)]),
+            cavity=np.concatenate([s.cavity for s in surfaces]),
+            void=np.concatenate([s.void for s in surfaces]),
+            point_map=self._joined_map([s.point_map for s in surfaces]),
+            fixed_map=self._joined_map([s.fixed_map for s in surfaces]),
+        )
+
+    def _joined_map(self, maps: list[csr_matrix]) -> csr_matrix:
+        n = self.layout.n_global
+        renumbered = [
+            csr_matrix((m.data, number[m.indices], m.indptr), shape=(m.shape[0], n))
+            for m, number in zip(maps, self._number, strict=True)
+        ]
+        return vstack(renumbered, format="csr")
+
+    def surface_positions(self) -> np.ndarray:
+        """Return the positions of the surface's points, shape (n_points, dim). Collective."""
+        return np.concatenate([part.surface_positions() for part in self.parts])
+
+    def surface_velocity(self) -> np.ndarray:
+        """Return the solution of the step last accepted at the surface's points, shape (n_points, dim). Collective."""
+        return np.concatenate([part.surface_velocity() for part in self.parts])
+
+    def fixed_velocity(self) -> np.ndarray:
+        """Return what the step prescribes of its solution by unknown, zero where free."""
+        g = np.empty(self.layout.n_global)
+        for part, number in zip(self.parts, self._number, strict=True):
+            g[number] = part.fixed_velocity()
+        return g
+
+    # ---- what others read -------------------------------------------------------------------------------------
+
+    def stock(self) -> Stock:
+        """Return this rank's share of momentum and energy of all parts."""
+        stocks = [part.stock() for part in self.parts]
+        momentum = np.sum([s.momentum for s in stocks], axis=0)
+        return Stock(momentum, sum(s.kinetic for s in stocks), sum(s.elastic for s in stocks))
+
+    def work(self, dt: float) -> Work:
+        """Return this rank's share of what was done to all parts in the step last accepted."""
+        works = [part.work(dt) for part in self.parts]
+        return Work(
+            gravity=sum(w.gravity for w in works),
+            damping=sum(w.damping for w in works),
+            boundary=sum(w.boundary for w in works),
+            loads=sum(w.loads for w in works),
+        )
+
+    def probe(self, body: str, at: list[float], quantity: str) -> np.ndarray:
+        """Return a quantity of a body's material point. Collective."""
+        for part in self.parts:
+            if body in part.names:
+                return part.probe(body, at, quantity)
+        raise InputError(f"a probe of {body!r} at {list(at)}: known solids are {', '.join(self.names)}")
+
+    def output(self) -> dict[str, Slab]:
+        """Return what the parts give, points and cells of one after those of the other. Collective."""
+        outputs = [part.output() for part in self.parts]
+        if not self._static:
+            self._points = _Stack(self.comm, [out["points"] for out in outputs])
+            self._static = {"points": self._points([out["points"] for out in outputs]), **self._cells(outputs)}
+        changing = [name for name in outputs[0] if name not in self._static]
+        return self._static | {name: self._points([out[name] for out in outputs]) for name in changing}
+
+    def _cells(self, outputs: list[dict[str, Slab]]) -> dict[str, Slab]:
+        """Return cells by points of all parts, and their bodies as numbered in the scene. Collective."""
+        stack = _Stack(self.comm, [out["cells"] for out in outputs])
+        first = np.cumsum([0] + [out["points"].shape[0] for out in outputs])
+        cells, body = [], []
+        for part, out, n in zip(self.parts, outputs, first, strict=False):
+            own = np.array([self.names.index(name) for name in part.names], dtype=out["body"].data.dtype)
+            cells.append(Slab(out["cells"].data + n, out["cells"].start, out["cells"].shape))
+            body.append(Slab(own[out["body"].data], out["body"].start, out["body"].shape))
+        return {"cells": stack(cells), "body": stack(body)}
+
+    def state(self) -> dict[str, Slab]:
+        """Return the state of all parts. Collective."""
+        states = [(kind, part.state()) for kind, part in zip(self.kinds, self.parts, strict=True)]
+        return {f"{kind}_{name}": piece for kind, state in states for name, piece in state.items()}
+
+    def restore(self, read: Reader) -> None:
+        """Take the state of all parts back. Collective."""
+        for kind, part in zip(self.kinds, self.parts, strict=True):
+            part.restore(lambda name, start, count, kind=kind: read(f"{kind}_{name}", start, count))  # type: ignore[misc]
+
+
+class _Stack:
+    """Puts rows of several global arrays one array after the other, and cuts them anew: a share for each rank.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    slabs : list of Slab
+        Pieces of the arrays, cut as those that are given later.
+    """
+
+    def __init__(self, comm: MPI.Comm, slabs: list[Slab]):
+        counts = [len(piece.data) for piece in slabs]
+        self._n = sum(piece.shape[0] for piece in slabs)
+        self._begin, end = slab(self._n, comm.rank, comm.size)
+        held = np.concatenate(_stacked_numbers(comm, counts))
+        self._fetch = Fetch(comm, Layout.of(comm, sum(counts)), held[self._begin : end])
+
+    def __call__(self, slabs: list[Slab]) -> Slab:
+        """Return this rank's piece of the whole. Collective."""
+        like = slabs[0]
+        data = self._fetch(np.concatenate([piece.data for piece in slabs]))
+        return Slab(data, (self._begin, *like.start[1:]), (self._n, *like.shape[1:]))
+
+
+def _stacked_numbers(comm: MPI.Comm, counts: list[int]) -> list[np.ndarray]:
+    """Return the joint numbers of each part's things, numbered rank after rank and on each part after part. Collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    counts : list of int
+        How many of each part this rank holds; a part's own numbers run rank after rank.
+
+    Returns
+    -------
+    list of ndarray of IntType
+        Ascending, by the part's own number.
+    """
+    every = np.array(comm.allgather(counts))
+    first = (np.cumsum(every) - every.ravel()).reshape(every.shape)
+    shift = first - (np.cumsum(every, axis=0) - every)
+    return [(np.arange(n.sum()) + np.repeat(by, n)).astype(IntType) for n, by in zip(every.T, shift.T, strict=True)]
