@@ -23,7 +23,7 @@ def field(comm=MPI.COMM_SELF, gravity=None, integrator="newmark", **solids):
 
 
 #: Steps of each scheme with inertia; that of the explicit one is below its limit.
-STEPS = {"newmark": 0.05, "bdf2": 0.05, "midpoint": 0.05, "symplectic-euler": 1e-3}
+STEPS = {"newmark": 0.05, "bdf2": 0.05, "midpoint": 0.05, "symplectic-euler": 5e-4}
 CLAMP = [{"where": "start", "fix": ["x", "y", "angle"]}]
 
 
