@@ -79,8 +79,6 @@ BROKEN = [
     (["solids.gate.supports.0.fix=['z']"], "solids.gate.supports.0.fix", "must be out of x, y"),
     (["solids.gate.supports.1.velocity={angle = 1.0}"], "supports.1.velocity.angle", "belongs to fixed axes only"),
     (["solids.gate.supports.0.velocity.angle='q'"], 'supports.0.velocity.angle = "q"', "unknown name 'q'"),
-    ([other(BOX)], SHAPE, "a scene has beams or other solids, not both"),
-    ([other(beam(more=", theory = 'euler-bernoulli'"))], "solids.other.shape.beam.theory", "one theory"),
     (["obstacles.post.shape=" + beam()], "obstacles.post.shape.beam", "only a solid can be a beam"),
     ([f"solids.gate.shape={BOX}"], "solids.gate.supports.0.where", "only a beam has a start and an end"),
     ([f"solids.gate.shape={BOX}"], "solids.gate.supports.0.fix", "only a beam has an angle"),

@@ -220,7 +220,8 @@ class NodalSolid(SolidField):
     def _assemble_lumped(self, lumped: LumpedEquation, time: float, dt: float) -> None:
         """Refresh the diagonal A only if the step's length has changed, and b. Collective."""
         stage, mean = self._stage or self._integrator.stage(self._motion(), dt), self._reference_mass
-        lag = lumped.lag(self.velocity)
+        # on all ranks or none, whichever bodies they have nodes of
+        lag = lumped.lag(self.velocity) if self._damping[:, 1].any() else None
         if lag is not None:
             stage = replace(stage, shift=lag)
         # most explicit steps send one array only
