@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import permutations
+from itertools import combinations
 
 import numpy as np
 from numba import njit
@@ -18,6 +18,9 @@ from petfsi.scene.checks import check_inside_grid
 from petfsi.scene.schema import Obstacle, Scene, Solid
 
 Mesh = tuple[np.ndarray, np.ndarray]
+
+#: Segments cross if they do so by more than this part of their length.
+TOUCH = 1e-9
 
 
 def build_bodies(scene: Scene) -> dict[str, Mesh]:
@@ -127,20 +130,32 @@ def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> n
 
 def _in_each_other(meshes: dict[str, Mesh]) -> list[str]:
     """Return a sentence for every pair of bodies that share material."""
-    counts: dict[tuple[str, str], int] = {}
-    for one, other in permutations(meshes, 2):
-        centres = meshes[one][0][meshes[one][1]].mean(axis=1)
-        points, cells = meshes[other]
-        if _apart(centres, points):
-            continue
-        count = int(np.count_nonzero(enclosed(points, boundary_facets(points, cells), centres)))
-        pair = (one, other) if list(meshes).index(one) < list(meshes).index(other) else (other, one)
-        counts[pair] = counts.get(pair, 0) + count
-    return [
-        f"solids.{second}.shape: overlaps solids.{first} ({count} cells); bodies must lie apart"
-        for (first, second), count in counts.items()
-        if count
+    found = []
+    for first, second in combinations(meshes, 2):
+        pair = meshes[first], meshes[second]
+        count = _covered_cells(*pair) + _covered_cells(*reversed(pair))
+        if count or _cross(*pair):
+            how = f"{count} cells" if count else "their outlines cross"
+            found.append(f"solids.{second}.shape: overlaps solids.{first} ({how}); bodies must lie apart")
+    return found
+
+
+def _covered_cells(one: Mesh, other: Mesh) -> int:
+    """Return how many cells of a body have their centres in another one."""
+    centres = one[0][one[1]].mean(axis=1)
+    if _apart(centres, other[0]):
+        return 0
+    return int(np.count_nonzero(enclosed(other[0], boundary_facets(*other), centres)))
+
+
+def _cross(one: Mesh, other: Mesh) -> bool:
+    """Whether the outlines of two bodies in the plane cross: no centre of slender ones need be in the other."""
+    if one[0].shape[1] != 2 or _apart(one[0], other[0]):
+        return False
+    segments = [
+        np.ascontiguousarray(points[boundary_facets(points, cells)], dtype=float) for points, cells in (one, other)
     ]
+    return bool(_any_crossing(*segments))
 
 
 def _apart(points: np.ndarray, others: np.ndarray) -> bool:
@@ -155,6 +170,26 @@ def enclosed(points: np.ndarray, facets: np.ndarray, at: np.ndarray) -> np.ndarr
     result = np.zeros(len(at), dtype=bool)
     result[near] = np.abs(_windings(corners, np.ascontiguousarray(at[near], dtype=float))) > 0.5
     return result
+
+
+@njit(cache=True)
+def _any_crossing(one, other):
+    """Whether any segment of one crosses one of the other by more than round-off; touching is none."""
+    for a in one:
+        for b in other:
+            if _astride(a, b) and _astride(b, a):
+                return True
+    return False
+
+
+@njit(cache=True)
+def _astride(a, b):
+    """Whether the ends of segment b lie on either side of the line through a."""
+    tx, ty = a[1, 0] - a[0, 0], a[1, 1] - a[0, 1]
+    first = tx * (b[0, 1] - a[0, 1]) - ty * (b[0, 0] - a[0, 0])
+    last = tx * (b[1, 1] - a[0, 1]) - ty * (b[1, 0] - a[0, 0])
+    least = TOUCH * (tx * tx + ty * ty + (b[1, 0] - b[0, 0]) ** 2 + (b[1, 1] - b[0, 1]) ** 2)
+    return (first > least and last < -least) or (first < -least and last > least)
 
 
 @njit(cache=True)
