@@ -104,6 +104,7 @@ def test_forces_alone_are_those_beside_the_matrix(dim, kind):
     d, inertia, shift = (wave(len(mesh.points), dim, seed=seed, size=0.02) for seed in (3, 4, 5))
     A, b = respond(elements, pattern_of(mesh), d, inertia, shift)
     M = respond(elements, pattern_of(mesh), 0 * d, a=1.0, k=0.0)[0]
+    np.testing.assert_array_equal(M, M.T)
     alone = np.empty_like(d)
     elements.forces(State(d, inertia, shift), alone)
     np.testing.assert_array_equal(alone, b)

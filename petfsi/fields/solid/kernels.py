@@ -75,14 +75,17 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
     @njit(cache=True)
     def forces(cells, basis, table, w, T, volume, mass, V, b):
         n_points = table.shape[0]
-        g, f = np.empty((nodes, dim)), np.empty((nodes, dim))
+        g, f, v = np.empty((nodes, dim)), np.empty((nodes, dim)), np.empty((nodes, dim))
         for e in range(cells.shape[0]):
+            for m in range(nodes):
+                for i in range(dim):
+                    v[m, i] = volume[e] * V[cells[e, m], i]
             for a in range(nodes):
                 for i in range(dim):
-                    f[a, i] = 0.0
-                for m in range(nodes):
-                    for i in range(dim):
-                        f[a, i] += volume[e] * mass[a, m] * V[cells[e, m], i]
+                    s = 0.0
+                    for m in range(nodes):
+                        s += mass[a, m] * v[m, i]
+                    f[a, i] = s
             for q in range(n_points):
                 shape_gradients(basis[e], table[q], g)
                 for a in range(nodes):
@@ -110,47 +113,56 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
         return total
 
     @njit(inline="always")
-    def add_stiffness(g, C, factor, Cg, K):
+    def add_stiffness(g, C, factor, T, K):
         """Add  factor g_a . C . g_b  to the blocks 0 < a <= b of K[a, b]."""
-        for b in range(1, nodes):
+        for a in range(1, nodes):
+            # T[i, (k, L)] = factor g_a . C in runs of dim^2 numbers, so that the compiler takes several at a time
             for i in range(dim):
-                for k in range(dim):
-                    for J in range(dim):
-                        s = 0.0
-                        for L in range(dim):
-                            s += C[i, J, k, L] * g[b, L]
-                        Cg[i, k, J] = factor * s
-            for a in range(1, b + 1):
+                for c in range(dim * dim):
+                    T[i, c] = factor * g[a, 0] * C[i, 0, c]
+                for J in range(1, dim):
+                    s = factor * g[a, J]
+                    for c in range(dim * dim):
+                        T[i, c] += s * C[i, J, c]
+            for b in range(a, nodes):
                 for i in range(dim):
                     for k in range(dim):
                         s = 0.0
-                        for J in range(dim):
-                            s += g[a, J] * Cg[i, k, J]
+                        for L in range(dim):
+                            s += T[i, dim * k + L] * g[b, L]
                         if plain:  # the only point
                             K[a, b, i, k] = s
                         else:
                             K[a, b, i, k] += s
 
     @njit(inline="always")
-    def close(K):
-        """Fill the blocks K[0, b]: a translation costs nothing, sum_a g_a = 0."""
-        for b in range(nodes):
+    def mirror(K):
+        """Fill one half of the blocks a, b > 0 with the other, so that the matrix is symmetric to the last bit."""
+        for a in range(1, nodes):
             for i in range(dim):
-                for k in range(dim):
-                    K[0, b, i, k] = 0.0
-        for b in range(1, nodes):
-            for a in range(1, b):
+                for k in range(i):
+                    K[a, a, i, k] = K[a, a, k, i]
+            for b in range(a + 1, nodes):
                 for i in range(dim):
                     for k in range(dim):
-                        K[0, b, i, k] -= K[a, b, i, k]
-                        K[0, a, i, k] -= K[a, b, k, i]
-            for i in range(dim):
-                for k in range(dim):
-                    K[0, b, i, k] -= K[b, b, min(i, k), max(i, k)]
+                        K[b, a, k, i] = K[a, b, i, k]
+
+    @njit(inline="always")
+    def close(K):
+        """Fill the blocks K[0, b] and K[b, 0]: a translation costs nothing, sum_a g_a = 0."""
         for b in range(1, nodes):
             for i in range(dim):
                 for k in range(dim):
-                    K[0, 0, i, k] -= K[0, b, i, k]
+                    s = 0.0
+                    for a in range(1, nodes):
+                        s -= K[a, b, i, k]
+                    K[0, b, i, k] = K[b, 0, k, i] = s
+        for i in range(dim):
+            for k in range(i, dim):
+                s = 0.0
+                for b in range(1, nodes):
+                    s -= K[0, b, i, k]
+                K[0, 0, i, k] = K[0, 0, k, i] = s
 
     @njit(inline="always")
     def clear(K):
@@ -160,37 +172,49 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                     for k in range(dim):
                         K[a, b, i, k] = 0.0
 
+    @njit(inline="always")
+    def add_mass(mass, factor, K):
+        """Add factor mass_ab I, of the half a <= b to both: the two may differ by round-off."""
+        for a in range(nodes):
+            for i in range(dim):
+                K[a, a, i, i] += factor * mass[a, a]
+            for b in range(a + 1, nodes):
+                s = factor * mass[a, b]
+                for i in range(dim):
+                    K[a, b, i, i] += s
+                    K[b, a, i, i] += s
+
+    @njit(inline="always")
+    def scatter(cells, K, node_ptr, slots, values):
+        for a in range(nodes):
+            row = cells[a]
+            if row >= node_ptr.shape[0] - 1:
+                continue
+            begin = node_ptr[row]
+            width = dim * (node_ptr[row + 1] - begin)
+            for b in range(nodes):
+                start = dim * (dim * begin + slots[a, b] - begin)
+                for i in range(dim):
+                    for k in range(dim):
+                        # of an index without a sign Numba does not ask whether it counts from the end
+                        values[np.uint64(start + i * width + k)] += K[a, b, i, k]
+
     @njit(cache=True)
     def tangent(cells, basis, table, w, C, volume, mass, A_M, A_K, node_ptr, slots, values):
         n_points = table.shape[0]
-        g, Cg = np.empty((nodes, dim)), np.empty((dim, dim, dim))
+        rows = C.reshape((C.shape[0], dim, dim, dim * dim))
+        g, T = np.empty((nodes, dim)), np.empty((dim, dim * dim))
         K = np.empty((nodes, nodes, dim, dim))
         for e in range(cells.shape[0]):
             if not plain:
                 clear(K)
             for q in range(n_points):
                 shape_gradients(basis[e], table[q], g)
-                add_stiffness(g, C[e * n_points + q], A_K * w[e, q], Cg, K)
+                add_stiffness(g, rows[e * n_points + q], A_K * w[e, q], T, K)
+            mirror(K)
             close(K)
-            for a in range(nodes):
-                for b in range(a, nodes):
-                    for i in range(dim):
-                        K[a, b, i, i] += A_M * volume[e] * mass[a, b]
-            for a in range(nodes):
-                row = cells[e, a]
-                if row >= node_ptr.shape[0] - 1:
-                    continue
-                begin = node_ptr[row]
-                width = dim * (node_ptr[row + 1] - begin)
-                for b in range(nodes):
-                    start = dim * (dim * begin + slots[e, a, b] - begin)
-                    for i in range(dim):
-                        for k in range(dim):
-                            # one half is the mirror of the other, so that the matrix is symmetric to the last bit
-                            if a < b or (a == b and i <= k):
-                                values[start + i * width + k] += K[a, b, i, k]
-                            else:
-                                values[start + i * width + k] += K[b, a, k, i]
+            add_mass(mass, A_M * volume[e], K)
+            scatter(cells[e], K, node_ptr, slots[e], values)
 
     return SimpleNamespace(
         gradient=gradient, contract=contract, forces=forces, kinetic=kinetic, tangent=tangent,
