@@ -16,6 +16,8 @@ MATERIALS = {
     "stable-neohookean": "petfsi.fields.solid.materials.stable:stable_neohookean",
     "linear": "petfsi.fields.solid.materials.linear:linear",
 }
+#: Materials whose elements may turn inside out on their way: back they come, or strain means nothing to them.
+INVERTIBLE = {"stable-neohookean", "linear"}
 #: Kinds of solids; those that a scene has several of are joined to one field.
 SOLIDS = {
     "simplex": "petfsi.fields.solid.solid:SimplexSolid",

@@ -161,6 +161,11 @@ class JointSolid(SolidField):
         for part in self.parts:
             part.set_scale(reference_mass)
 
+    def judge(self, x: np.ndarray, dt: float) -> None:
+        """Let every part judge its own. Collective."""
+        for part, mine in self._split(x):
+            part.judge(mine, dt)
+
     def stable_step(self) -> float:
         """Return the shortest of the parts' stable steps, s. Collective."""
         return min(part.stable_step() for part in self.parts)
