@@ -79,8 +79,6 @@ BROKEN = [
     (["solids.gate.supports.0.fix=['z']"], "solids.gate.supports.0.fix", "must be out of x, y"),
     (["solids.gate.supports.1.velocity={angle = 1.0}"], "supports.1.velocity.angle", "belongs to fixed axes only"),
     (["solids.gate.supports.0.velocity.angle='q'"], 'supports.0.velocity.angle = "q"', "unknown name 'q'"),
-    ([other(BOX)], SHAPE, "a scene has beams or other solids, not both"),
-    ([other(beam(more=", theory = 'euler-bernoulli'"))], "solids.other.shape.beam.theory", "one theory"),
     (["obstacles.post.shape=" + beam()], "obstacles.post.shape.beam", "only a solid can be a beam"),
     ([f"solids.gate.shape={BOX}"], "solids.gate.supports.0.where", "only a beam has a start and an end"),
     ([f"solids.gate.shape={BOX}"], "solids.gate.supports.0.fix", "only a beam has an angle"),
@@ -117,6 +115,11 @@ def test_a_mistake_is_named_with_its_key_and_what_is_allowed(sets, key, allowed)
     lines = str(caught.value).splitlines()[1:]
     found = [line for line in lines if key in line and allowed in line]
     assert len(found) == 1, caught.value
+
+
+@pytest.mark.parametrize("shape", [BOX, beam(more=", theory = 'euler-bernoulli'")], ids=["block", "another theory"])
+def test_a_scene_may_have_several_kinds_of_solids(shape):
+    assert "(gate 9 nodes, 4 cells; other " in describe_plan(scene_from_dict(gate(other(shape))))
 
 
 def test_a_beam_needs_a_plane():
