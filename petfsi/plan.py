@@ -153,12 +153,15 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     """Return nodes and cells of each solid; where counting is not enough the meshes are built and judged."""
     boxes = {name: cells for name, solid in scene.solids.items() if (cells := _plain_cells(solid)) is not None}
     if len(boxes) == len(scene.solids) and not scene.obstacles:
-        nodes = {name: math.prod(n + 1 for n in box) for name, box in boxes.items()}
+        # the middles of all edges of a cell's simplices are those of its edges, faces and the cell itself
+        orders = {name: 2 if scene.solids[name].elements == "quadratic" else 1 for name in boxes}
+        nodes = {name: math.prod(orders[name] * n + 1 for n in box) for name, box in boxes.items()}
         return nodes, {name: math.prod(box) * math.factorial(scene.dim) for name, box in boxes.items()}
     from petfsi.geometry.beams import axis_mesh
     from petfsi.geometry.bodies import build_bodies
     from petfsi.geometry.meshes import read_surface
     from petfsi.geometry.obstacles import obstacle_surfaces
+    from petfsi.geometry.quadratic import with_middles
 
     errors, meshes = [], {}
     readers: list[Callable[[], object]] = [
@@ -177,6 +180,9 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
         raise InputError("\n".join(errors))
     beams = {name: solid.shape.beam for name, solid in scene.solids.items() if solid.shape.beam is not None}
     meshes |= {name: axis_mesh(beam) for name, beam in beams.items()}
+    for name, solid in scene.solids.items():
+        if solid.elements == "quadratic":
+            meshes[name] = with_middles(*meshes[name])
     return {n: len(points) for n, (points, _) in meshes.items()}, {n: len(cells) for n, (_, cells) in meshes.items()}
 
 

@@ -136,7 +136,8 @@ class Simulation:
             outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt))
         with self.phase("accept"):
             self._accept(t, dt)
-            petsc.collect_garbage()
+            if len(self.fields) > 1 or not self.stable.limited:  # else no step makes any
+                petsc.collect_garbage()
         self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
 
     def _rewind(self) -> None:

@@ -10,8 +10,8 @@ from petfsi.scene.schema import Time
 
 #: The stable step is found anew after so many steps at most,
 EVERY = 100
-#: and as soon as nodes may have moved by this part of the shortest edge.
-TRAVEL = 0.02
+#: and when an edge has changed by half this part of its length, so that none ever does by more than this.
+STRETCH = 0.05
 #: Sub-steps are this part of the stable step at most: it may shrink until it is found anew.
 MARGIN = 0.9
 #: A step that must be divided more often has blown up.
@@ -21,9 +21,10 @@ MOST = 100_000
 class StableStep:
     """Keeps a step below the stable one, as ``time.above_limit`` says.
 
-    Finding the stable step costs about as much as a step, so it is found before the first step, every ``EVERY``
-    steps, whenever the fastest node may have come ``TRAVEL`` of the shortest edge farther, and after ``forget``.
-    Once is enough where it never changes.
+    Finding the stable step costs some 30 steps. It is found before the first step, every ``EVERY`` steps, after
+    ``forget``, and when the body may have changed too much since: the ends of an edge can have moved apart by twice
+    the way of the fastest node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once
+    is enough where it never changes.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ class StableStep:
         self.limited = solid is not None and solid.explicit
         self._subcycles = time.above_limit == "subcycle"
         self.limit = math.inf
-        self._steps, self._travelled = EVERY, 0.0
+        self._steps, self._way, self._stretch = EVERY, 0.0, 0.0
 
     @property
     def divides(self) -> bool:
@@ -83,12 +84,16 @@ class StableStep:
     def _find(self) -> None:
         solid = self._solid
         assert solid is not None
-        if self._steps >= EVERY or self._travelled > TRAVEL * solid.finest:
+        due = self._steps >= EVERY
+        if not due and self._stretch + 2 * self._way / solid.finest > STRETCH:
+            self._stretch, self._way = solid.stretch(), 0.0
+            due = not self._stretch < STRETCH / 2
+        if due:
             self.limit = solid.stable_step()
-            self._steps, self._travelled = 0, 0.0
+            self._steps, self._way, self._stretch = 0, 0.0, 0.0
 
     def moved(self, way: float) -> None:
         """Count a step in which no node moved farther than ``way``, m."""
         assert self._solid is not None
         if not self._solid.is_linear:
-            self._steps, self._travelled = self._steps + 1, self._travelled + way
+            self._steps, self._way = self._steps + 1, self._way + way

@@ -13,8 +13,8 @@ from petfsi.simulation import Simulation
 LEFT = [{"where": "left", "fix": ["x", "y"]}]
 
 
-def block(cells=(1, 1), size=(1.0, 1.0), time=None, gravity=None, **solid):
-    """Return a scene of one block, clamped at its left side; ``accounts`` are kept."""
+def block(cells=(1, 1), size=(1.0, 1.0), time=None, gravity=None, output=None, **solid):
+    """Return a scene of one block, clamped at its left side."""
     body = {
         "shape": {"box": {"origin": [0.0, 0.0], "size": list(size), "cells": list(cells)}},
         "density": 1.3, "young": 20.0, "poisson": 0.3, "material": "neohookean", "supports": LEFT,

@@ -277,3 +277,34 @@ def test_ranks_agree_on_followers():
             step(solid, 0.1 * k, 0.1)
         ends.append(gathered(solid, "displacement"))
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-10)
+
+
+@pytest.mark.parallel([1, 3])
+def test_an_explicit_beam_swings_below_its_limit_and_is_refused_above(theory):
+    shape = {"thickness": 0.1, "start": (0.0, 0.0), "end": (1.0, 0.0)}
+    bar = beam(theory, 4, **shape, supports=CLAMP, initial={"velocity": [0.0, "0.2*x*x", "0.4*x"]})
+
+    def scene(dt):
+        time = {"end": 50.0, "dt": dt, "integrator": "symplectic-euler"}
+        return Scene.model_validate({"dim": 2, "time": time, "solids": {"b": bar}})
+
+    with prepared(scene(1e-3)) as sim:
+        limit = sim.solid.stable_step()
+        solid = field(b=bar | {"mass": "lumped"})
+        zero = np.zeros_like(solid.displacement)
+        mass = solid._elements.lumped_mass(len(zero)).ravel()
+        free = np.setdiff1d(np.arange(zero.size), solid._supports.unknowns)
+        values = np.zeros(len(solid._pattern.indices))
+        solid._elements.assemble(State(zero, zero, zero), 0.0, 1.0, solid._pattern, values, zero.copy())
+        K = np.zeros((zero.size, zero.size))
+        K[np.repeat(np.arange(zero.size), np.diff(solid._pattern.indptr)), solid._pattern.indices] = values
+        pencil = (K / np.sqrt(np.outer(mass, mass)))[np.ix_(free, free)]
+        assert limit == pytest.approx(2 / np.sqrt(np.linalg.eigvalsh(pencil)[-1]), rel=0.02)
+    with prepared(scene(0.9 * limit)) as sim:
+        energy = []
+        for _ in range(1000):
+            sim.advance()
+            energy.append(sum(sim.solid.energies().values()))
+        assert np.ptp(energy) < 0.05 * np.mean(energy)
+    with pytest.raises(InputError, match="the stable step of symplectic-euler is"), prepared(scene(1.1 * limit)):
+        pass

@@ -7,7 +7,6 @@ from solid_cases import gathered, step
 
 from petfsi.errors import InputError
 from petfsi.fields.beam.beam import BeamSolid
-from petfsi.integrators import INTEGRATORS
 from petfsi.scene.schema import Scene
 
 LENGTH = 1.25
@@ -23,6 +22,8 @@ def field(comm=MPI.COMM_SELF, gravity=None, integrator="newmark", **solids):
     return BeamSolid(comm, Scene.model_validate({"dim": 2, "gravity": gravity, "time": time, "solids": solids}))
 
 
+#: Steps of each scheme with inertia; that of the explicit one is below its limit.
+STEPS = {"newmark": 0.05, "bdf2": 0.05, "midpoint": 0.05, "symplectic-euler": 5e-4}
 CLAMP = [{"where": "start", "fix": ["x", "y", "angle"]}]
 
 
@@ -111,12 +112,12 @@ def busy(comm, theory, integrator):
 
 
 @pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_ranks_agree(theory, integrator):
+@pytest.mark.parametrize("integrator, dt", STEPS.items())
+def test_ranks_agree(theory, integrator, dt):
     alone, shared = busy(MPI.COMM_SELF, theory, integrator), busy(MPI.COMM_WORLD, theory, integrator)
     for k in range(3):
-        step(alone, 0.05 * k, 0.05)
-        step(shared, 0.05 * k, 0.05)
+        step(alone, dt * k, dt)
+        step(shared, dt * k, dt)
     for name in ("displacement", "velocity"):
         np.testing.assert_allclose(gathered(shared, name), gathered(alone, name), atol=1e-10)
     np.testing.assert_allclose(shared.surface_positions(), alone.surface_positions(), atol=1e-11)
@@ -124,12 +125,12 @@ def test_ranks_agree(theory, integrator):
 
 
 @pytest.mark.parallel([1, 3])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_restored_beam_goes_on_bit_for_bit(theory, integrator):
+@pytest.mark.parametrize("integrator, dt", STEPS.items())
+def test_a_restored_beam_goes_on_bit_for_bit(theory, integrator, dt):
     comm = MPI.COMM_WORLD
     solid, again = busy(comm, theory, integrator), busy(comm, theory, integrator)
     for k in range(2):
-        step(solid, 0.05 * k, 0.05)
+        step(solid, dt * k, dt)
     whole = {name: np.concatenate(comm.allgather(slab.data)) for name, slab in solid.state().items()}
 
     def read(name, start, count):
@@ -137,7 +138,7 @@ def test_a_restored_beam_goes_on_bit_for_bit(theory, integrator):
 
     again.restore(read)
     for one in (solid, again):
-        step(one, 0.1, 0.05)
+        step(one, 2 * dt, dt)
     np.testing.assert_array_equal(solid.displacement, again.displacement)
     np.testing.assert_array_equal(solid.velocity, again.velocity)
 

@@ -8,11 +8,13 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from mpi4py import MPI
 from processes import environment, launcher
 
 from petfsi import __version__, cli
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
+from petfsi.fields.solid import SimplexSolid
 from petfsi.plan import DEFAULT_OPTIONS, default_options, describe_plan, skipped
 from petfsi.scene.load import scene_from_dict
 
@@ -213,6 +215,7 @@ TOGETHER = """
 import sys
 from petfsi import cli
 from petfsi.errors import InputError, SolveError
+from petfsi.fields.solid import SimplexSolid
 cli.AGREE_SECONDS = {patience}
 def work(comm):
     {body}
@@ -268,6 +271,20 @@ def test_the_plan_counts_what_is_solved():
 def test_the_plan_says_which_options_apply():
     text = describe_plan(plan_scene(), ["-fsi_ksp_rtol", "1e-6", "-options_file", "split.opts", "-log_view"])
     assert "options:     split.opts; over it -fsi_ksp_rtol 1e-6 -log_view\n" in text
+
+
+@pytest.mark.parametrize("where", ["left", {"box": {"origin": [-1.0] * 3, "size": [1.1, 9.0, 9.0]}}])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_plan_counts_the_middle_nodes_of_quadratic_elements(dim, where):
+    """Counted from the box, and from the mesh that a place in it needs."""
+    box = {"origin": [0.0] * dim, "size": [1.0] * dim, "cells": [2, 3, 1][:dim]}
+    if isinstance(where, dict):
+        where = {"box": {key: value[:dim] for key, value in where["box"].items()}}
+    block = {"shape": {"box": box}, "density": 1.0, "young": 1.0, "poisson": 0.0, "elements": "quadratic"}
+    block["supports"] = [{"where": where, "fix": ["x"]}]
+    scene = scene_from_dict({"dim": dim, "time": {"end": 1.0, "dt": 0.1}, "solids": {"block": block}})
+    nodes = SimplexSolid(MPI.COMM_SELF, scene).layout.n_global // dim
+    assert f"block {nodes} nodes" in describe_plan(scene) and nodes == [35, 105][dim - 2]
 
 
 @pytest.mark.parametrize("cells, named", [(24, "monolithic.opts"), (26, "solid-large.opts")])

@@ -252,6 +252,71 @@ def test_only_fully_integrated_linear_elements_lock(dim):
     assert grown > (0.9 if dim == 2 else 0.7) * fine, (grown, fine)
 
 
+# ---- Cook's membrane ----------------------------------------------------------------------------------------
+
+#: Deflection of (48, 52) for a neo-Hookean body in plane strain, Q3 to Q4 elements, known to 0.0005 and 0.005.
+COOK = {0.3: 7.8927, 0.4999: 6.960}
+
+
+def cook_mesh(n, kind):
+    points, cells = box_mesh(Box(origin=[0, 0], size=[1, 1], cells=[n, n]))
+    xi, eta = points.T
+    return simplices(np.column_stack((48 * xi, 44 * xi + eta * (44 - 28 * xi))), cells, *kind)
+
+
+def end_load(mesh, order):
+    """Return the nodal forces of a dead shear traction of 6.25 on the right edge."""
+    x, load = mesh.points, np.zeros_like(mesh.points)
+    edge = np.flatnonzero(x[:, 0] > 48 - 1e-9)
+    edge = edge[np.argsort(x[edge, 1])]
+    weights = [1 / 2, 1 / 2] if order == "linear" else [1 / 6, 4 / 6, 1 / 6]
+    n = len(weights) - 1
+    for a, weight in enumerate(weights):
+        np.add.at(load[:, 1], edge[a::n][: (len(edge) - 1) // n], weight * 6.25 * 16 * n / (len(edge) - 1))
+    return load
+
+
+def cook_deflection(n, kind, poisson, steps):
+    """Return the deflection of (48, 52) by Newton's method, the load grown in equal steps."""
+    mesh = cook_mesh(n, kind)
+    elements = elements_of(mesh, "neohookean", *lame_parameters(240.565, poisson), volumetric=kind[1])
+    pattern, load = pattern_of(mesh), end_load(mesh, kind[0])
+    d, rest, b = np.zeros_like(load), np.zeros_like(load), np.empty_like(load)
+    values, free = np.empty(len(pattern.indices)), np.repeat(mesh.points[:, 0] > 1e-9, 2)
+
+    def residual(d, share):
+        elements.forces(State(d, rest, rest), b)
+        return np.where(free, (b + share * load).ravel(), 0.0)
+
+    for share in np.arange(1, steps + 1) / steps:
+        r = residual(d, share)
+        while np.linalg.norm(r) > 1e-7 * np.linalg.norm(load):
+            elements.assemble(State(d, rest, rest), 0.0, 1.0, pattern, values, b)
+            K = csr_matrix((values, pattern.indices, pattern.indptr), shape=(d.size, d.size))
+            way, length, before = np.zeros(d.size), 1.0, np.linalg.norm(r)
+            way[free] = spsolve(K[free][:, free].tocsc(), r[free])
+            start = d
+            while True:
+                d = start + length * way.reshape(d.shape)
+                r = residual(d, share)
+                if np.linalg.norm(r) < before or length < 1e-3:
+                    break
+                length /= 2
+            assert length >= 1e-3, (share, before)
+    return d[np.argmin(np.linalg.norm(mesh.points - [48, 52], axis=1)), 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poisson, order, rule, bar", [
+    (0.3, "linear", "full", 0.01), (0.3, "linear", "reduced", 0.01),
+    (0.3, "quadratic", "full", 0.005), (0.3, "quadratic", "reduced", 0.005),
+    (0.4999, "linear", "reduced", 0.02), (0.4999, "quadratic", "full", 0.02), (0.4999, "quadratic", "reduced", 0.02),
+])  # fmt: skip
+def test_cooks_membrane(poisson, order, rule, bar):
+    tip = cook_deflection(32, (order, rule), poisson, 4 if poisson < 0.4 else 8)
+    assert tip == pytest.approx(COOK[poisson], rel=bar)
+
+
 # ---- ranks --------------------------------------------------------------------------------------------------
 
 

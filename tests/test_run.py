@@ -22,6 +22,8 @@ from petfsi.solve import shipped_options
 
 SCENES = Path(__file__).parent / "scenes"
 BAR = SCENES / "bar2d.toml"
+#: So that an explicit step takes not too many sub-steps.
+HEAVY_BAR = ("--set", "time.above_limit=subcycle", "--set", "solids.bar.density=2000", "--set", "solids.bar.damping={}")
 PETFSI = Path(sys.executable).with_name("petfsi")
 
 
@@ -112,11 +114,16 @@ def test_a_killed_run_resumes_bit_for_bit(ranks, straight, tmp_path):
 
 @pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize(
-    "integrator, dt",
-    [("newmark", "(1 + t)/40"), ("bdf2", "(1 + 0.4*sin(20*t))/30"), ("midpoint", "(1 + 0.4*sin(20*t))/30")],
+    "integrator, dt, options",
+    [
+        ("newmark", "(1 + t)/40", ()),
+        ("bdf2", "(1 + 0.4*sin(20*t))/30", ()),
+        ("midpoint", "(1 + 0.4*sin(20*t))/30", ("-fsi_snes_type", "newtonls")),
+        ("symplectic-euler", "(1 + 0.4*sin(20*t))/30", HEAVY_BAR),
+    ],
 )
-def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, ranks, tmp_path):
-    sets = ("--set", f"time.integrator={integrator}", "--set", f"time.dt='{dt}'", "--set", "time.end=0.3")
+def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, options, ranks, tmp_path):
+    sets = (*options, "--set", f"time.integrator={integrator}", "--set", f"time.dt='{dt}'", "--set", "time.end=0.3")
     sets = (*sets, "--set", "checkpoint.every=0.11")
     for name, steps in (("straight", ()), ("stopped", ("--steps", 6))):
         petfsi("run", BAR, "--out", tmp_path / name, *sets, *steps, ranks=ranks)
@@ -130,6 +137,32 @@ def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, r
     history = read_history(tmp_path / "straight" / "history.csv")
     np.testing.assert_allclose(np.cumsum(history["dt"][1:]), history["time"][1:], rtol=1e-14)
     assert 0.3 <= history["time"][-1] < 0.3 + history["dt"][-1] and np.ptp(history["dt"][1:]) > 0.005
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("integrator", ["static", "symplectic-euler"])
+def test_a_stopped_run_of_a_solid_alone_goes_on_bit_for_bit(integrator, ranks, tmp_path):
+    """In statics under a growing load; explicitly in sub-steps whose number changes."""
+    texts = {
+        "static": ("gravity=[0, '-2*t']", "time.dt='(1 + t)/20'", "time.end=0.8", "checkpoint.every=0.3"),
+        "symplectic-euler": (
+            "time.dt='(1 + 20*t)/1000'",
+            "time.above_limit=subcycle",
+            "time.end=0.03",
+            "checkpoint.every=0.01",
+        ),
+    }[integrator]
+    words = [f"time.integrator={integrator}", "solids.strip.material=neohookean", *texts]
+    words.append("solids.strip.shape.box.cells=[12, 2]")
+    sets = [word for text in words for word in ("--set", text)]
+    for name, steps in (("straight", ()), ("stopped", ("--steps", 7))):
+        petfsi("run", SCENES / "beam.toml", "--out", tmp_path / name, *sets, *steps, ranks=ranks)
+    petfsi("resume", tmp_path / "stopped", ranks=ranks)
+    histories = [(tmp_path / name / "history.csv").read_bytes() for name in ("straight", "stopped")]
+    assert histories[0] == histories[1]
+    history = read_history(tmp_path / "straight" / "history.csv")
+    column = {"static": "newton", "symplectic-euler": "substeps"}[integrator]
+    assert len(history["step"]) > 12 and history[column].max() > 1 and abs(history["tip.y"][-1]) > 1e-3
 
 
 @pytest.mark.parametrize("ranks", [1, 2])

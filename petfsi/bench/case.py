@@ -103,3 +103,11 @@ def history(comm: MPI.Comm, scene: Scene, options: str, steps: int, column: str 
             sim.advance()
             values.append(sim.probe()[wanted])
     return np.array(values)
+
+
+def dense(mat: PETSc.Mat) -> np.ndarray:
+    """Return a small matrix whole, on every rank. Collective."""
+    copy = mat.convert("dense", PETSc.Mat())
+    rows = copy.getDenseArray().copy()
+    copy.destroy()
+    return np.concatenate(mat.comm.tompi4py().allgather(rows))

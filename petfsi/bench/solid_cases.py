@@ -39,6 +39,15 @@ ELASTICA = {1: (0.30172, 0.05643), 2: (0.49346, 0.16064), 5: (0.71379, 0.38763),
 SLENDER = 1e-3
 
 
+#: The lowest angular frequencies of cantilevers over sqrt(EI / (rho A L^4)), by theory of the beam and thickness over
+#: length: Timoshenko's with nu = 0.3 and kappa = 5/6, roots of the transfer matrix; Euler's and Bernoulli's,
+#: (beta L)^2 with cos(beta L) cosh(beta L) = -1.
+FREQUENCIES = {
+    ("timoshenko", 0.1): (3.488355, 20.906915, 54.988380),
+    ("euler-bernoulli", SLENDER): (3.516015268, 22.034491564, 61.697214409),
+}
+
+
 @dataclass(frozen=True)
 class Statics:
     """A scene of one load, put on in steps, and where its probe ``tip`` ends up."""
@@ -75,7 +84,7 @@ def cook(comm: MPI.Comm, folder: Path, n: int, poisson: float, elements: str, vo
 def csm(comm: MPI.Comm, folder: Path, case: str, thick: int, elements: str) -> Statics:
     """Return the bar under gravity, ``thick`` quadrilaterals high. Collective."""
     young, exact = CSM_STATIC[case]
-    scene = _scene(_bar(comm, folder, thick, elements, young), (TIP, CENTRE[1]), "static", end=1.0, dt=0.5, ramp=True)
+    scene = _scene(_bar(comm, folder, thick, elements, young), (TIP, CENTRE[1]), "static", 1.0, 0.5, f"{GRAVITY}*t")
     return Statics(case, scene, exact, {"elements": elements, "cells": thick})
 
 
@@ -83,7 +92,7 @@ def csm3(comm: MPI.Comm, folder: Path, thick: int, elements: str, integrator: st
     """Return the bar let go from rest under gravity, explicit schemes in sub-steps. Collective."""
     solid = _bar(comm, folder, thick, elements, CSM3_YOUNG)
     explicit: dict[str, Any] = {"above_limit": "subcycle"} if integrator == "symplectic-euler" else {}
-    return _scene(solid, (TIP, CENTRE[1]), integrator, end, dt, **explicit)
+    return _scene(solid, (TIP, CENTRE[1]), integrator, end, dt, GRAVITY, **explicit)
 
 
 def elastica(alpha: float, n: int) -> Statics:
@@ -102,12 +111,19 @@ def roll_up(n: int) -> Statics:
     return Statics("roll-up", scene, (-1.0, 0.0), {"elements": "timoshenko", "cells": n})
 
 
-def _beam(n: int) -> dict[str, Any]:
-    beam = {"start": [0.0, 0.0], "end": [1.0, 0.0], "thickness": SLENDER, "elements": n, "theory": "timoshenko"}
+def cantilever(theory: str, thickness: float, n: int, dt: float) -> Scene:
+    """Return a cantilever of unit length, mass and EI, at rest."""
+    solid = _beam(n, theory, thickness) | {"poisson": 0.3}
+    return _scene(solid, (1.0, 0.0), "newmark", end=1.0, dt=dt)
+
+
+def _beam(n: int, theory: str = "timoshenko", thickness: float = SLENDER) -> dict[str, Any]:
+    """Return a clamped beam of unit length, mass and EI."""
+    beam = {"start": [0.0, 0.0], "end": [1.0, 0.0], "thickness": thickness, "elements": n, "theory": theory}
     return {
         "shape": {"beam": beam},
-        "density": 1.0,
-        "young": 12 / SLENDER**3,
+        "density": 1 / thickness,
+        "young": 12 / thickness**3,
         "poisson": 0.0,
         "supports": [{"where": "start", "fix": ["x", "y", "angle"]}],
     }
@@ -133,19 +149,17 @@ def _bar(comm: MPI.Comm, folder: Path, thick: int, elements: str, young: float) 
 
 
 def _scene(
-    solid: dict[str, Any], at: tuple[float, float], integrator: str, end: float, dt: float, ramp: bool = False,
-    **time: Any,
+    solid: dict[str, Any], at: tuple[float, float], integrator: str, end: float, dt: float,
+    gravity: str | float = 0.0, **time: Any,
 ) -> Scene:  # fmt: skip
-    heavy = "poisson" in solid and solid["density"] == DENSITY
     data = {
         "dim": 2,
+        "gravity": [0.0, gravity],
         "time": {"end": end, "dt": dt, "integrator": integrator, **time},
         "solids": {"body": solid},
         "probes": {"tip": {"of": "body", "at": list(at), "quantity": "displacement"}},
         "output": {"accounts": False},
     }
-    if heavy:
-        data["gravity"] = [0.0, f"{GRAVITY}*t" if ramp else GRAVITY]
     return scene_from_dict(data)
 
 

@@ -30,11 +30,10 @@ import meshio
 import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from petfsi import build
 from petfsi.bench import theory
-from petfsi.bench.case import ITERATED, MONOLITHIC, SPLIT, Case, history, job, simulation
+from petfsi.bench.case import ITERATED, MONOLITHIC, SPLIT, Case, dense, history, job, simulation
 from petfsi.bench.report import Report, Row
 from petfsi.couplings.base import Coupling
 from petfsi.errors import SolveError
@@ -196,23 +195,16 @@ def growth_of_own_matrices(scene: Scene) -> float:
     for h in (2 * DT, DT):
         for part in parts:
             part.assemble(0.0, h)
-        blocks.append(_dense(solid.block))
+        blocks.append(dense(solid.block))
     free = np.count_nonzero(blocks[0], axis=1) > 1  # rows of held unknowns have a diagonal alone
     A2, A1 = (A[np.ix_(free, free)] for A in blocks)
     # A(h) = (1/h + a0) M + (a1 + h/2) K at two steps
     coefficients = np.array([[1 / h + body.damping.mass, body.damping.stiffness + h / 2] for h in (2 * DT, DT)])
     inverse = np.linalg.inv(coefficients)
     M, K = (row[0] * A2 + row[1] * A1 for row in inverse)
-    pressure = np.linalg.solve(_dense(fluid.block), _dense(coupling.blocks["pressure", "solid"]))
-    added = -DT * _dense(coupling.blocks["solid", "pressure"]) @ pressure
+    pressure = np.linalg.solve(dense(fluid.block), dense(coupling.blocks["pressure", "solid"]))
+    added = -DT * dense(coupling.blocks["solid", "pressure"]) @ pressure
     return theory.split_growth(M, K, added[np.ix_(free, free)], DT, body.damping.mass, body.damping.stiffness)
-
-
-def _dense(mat: PETSc.Mat) -> np.ndarray:
-    copy = mat.convert("dense", PETSc.Mat())
-    values = copy.getDenseArray().copy()
-    copy.destroy()
-    return values
 
 
 # ---- the studies --------------------------------------------------------------------------------------------

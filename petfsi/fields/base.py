@@ -252,6 +252,10 @@ class SolidField(Field):
         """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
 
     @abstractmethod
+    def stretch(self) -> float:
+        """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
+
+    @abstractmethod
     def along_axes(self, x: np.ndarray) -> np.ndarray:
         """Return the velocities along the axes of this rank's nodes from unknowns x (SI), shape (n, dim)."""
 

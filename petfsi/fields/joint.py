@@ -167,6 +167,10 @@ class JointSolid(SolidField):
         """Return the shortest of the parts' stable steps, s. Collective."""
         return min(part.stable_step() for part in self.parts)
 
+    def stretch(self) -> float:
+        """Return the largest relative change of an edge of any part since the last ``stable_step``. Collective."""
+        return max(part.stretch() for part in self.parts)
+
     def along_axes(self, x: np.ndarray) -> np.ndarray:
         """Return the velocities along the axes of all nodes, shape (n_owned, dim)."""
         return np.concatenate([part.along_axes(mine) for part, mine in self._split(x)])

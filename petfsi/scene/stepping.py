@@ -29,6 +29,7 @@ class Stepping:
         self.end = time.end
         self._dt = Expression(time.dt, ("t",), key="time.dt")
         self.constant = self._dt.is_constant
+        self._length: float | None = None  # of all steps, once it is known
 
     def length(self, t: float) -> float:
         """Return the length of the step that begins at t, s.
@@ -38,8 +39,11 @@ class Stepping:
         ExpressionError
             If it is not finite, zero, negative, or no more than round-off.
         """
+        if self._length is not None:
+            return self._length
         dt = float(self._dt(t=t))
         if dt > (0.0 if self.constant else SHORTEST * self.end):
+            self._length = dt if self.constant else None
             return dt
         at = "" if self.constant else f"is {dt:g} at t = {t:g}; "
         wanted = f"must be greater than {SHORTEST:g} of time.end" if dt > 0 else "must be greater than 0 (s)"

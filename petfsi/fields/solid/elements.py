@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from petfsi.fields.solid.kernels import kernels
-from petfsi.fields.solid.materials import Material, linear
+from petfsi.fields.solid.materials import Material
+from petfsi.fields.solid.materials.linear import linear
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.patches import barycentric_gradients
 from petfsi.fields.solid.pattern import Pattern

@@ -220,14 +220,15 @@ class NodalSolid(SolidField):
     def _assemble_lumped(self, lumped: LumpedEquation, time: float, dt: float) -> None:
         """Refresh the diagonal A only if the step's length has changed, and b. Collective."""
         stage, mean = self._stage or self._integrator.stage(self._motion(), dt), self._reference_mass
-        lag = lumped.lag(self.velocity)
+        # on all ranks or none, whichever bodies they have nodes of
+        lag = lumped.lag(self.velocity) if self._damping[:, 1].any() else None
         if lag is not None:
             stage = replace(stage, shift=lag)
         # most explicit steps send one array only
-        sent = (stage.tangent_at,) if lag is None else (stage.tangent_at, stage.shift)
-        d, *lags = np.split(self._with_shared(np.concatenate(sent, axis=1)), len(sent), axis=1)
-        rest = np.zeros_like(d)
-        state = State(d, rest, lags[0] if lags else rest)
+        sent = stage.tangent_at if lag is None else np.concatenate((stage.tangent_at, stage.shift), axis=1)
+        local = self._with_shared(sent)
+        rest = np.zeros((len(local), self.width))
+        state = State(local[:, : self.width], rest, rest if lag is None else local[:, self.width :])
         b = self.rhs.reshape(-1, self.width)
         self._elements.forces(state, b)
         b += lumped.mass * stage.inertia
@@ -282,7 +283,7 @@ class NodalSolid(SolidField):
         """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
         if self._lumped is None:
             return np.inf
-        d = self._with_shared(self.displacement)
+        d = self._measured = self._with_shared(self.displacement)
         rest, free = np.zeros_like(d), ~self._is_held[: self._mesh.n_owned]
         here, there = np.empty_like(self.displacement), np.empty_like(self.displacement)
         self._elements.forces(State(d, rest, rest), here)
@@ -296,6 +297,22 @@ class NodalSolid(SolidField):
         start = np.where(free, start[self._mesh.natural[: self._mesh.n_owned]], 0.0)
         eigenvalue = largest_eigenvalue(self.comm, stiffness, self._lumped.mass, start)
         return stable_step(eigenvalue, float(self._damping[:, 1].max()))
+
+    def stretch(self) -> float:
+        """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
+        start, end, length = self._edges
+        change = self._with_shared(self.displacement) - self._measured
+        change = np.abs(change[end] - change[start])
+        change[:, : self.dim] /= length[:, None]
+        return self.comm.allreduce(float(change.max(initial=0.0)), MPI.MAX)
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both ends of every pair of nodes of this rank's elements, and their distance at rest, m."""
+        a, b = np.triu_indices(self._mesh.cells.shape[1], 1)
+        pairs = self._mesh.cells[:, np.stack((a, b), axis=1)].reshape(-1, 2)
+        start, end = np.unique(np.sort(pairs, axis=1), axis=0).T
+        return start, end, np.linalg.norm(self._mesh.points[end] - self._mesh.points[start], axis=1)
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the velocities w and move the nodes."""
@@ -333,8 +350,12 @@ class NodalSolid(SolidField):
         return diagonal
 
     def _prescribe(self, stage: Stage, time: float, dt: float) -> None:
-        instants, placed = self._integrator.instants(dt), self._supports.placed
-        self._prescribed = np.mean([self._supports.velocities(time + t).copy() for t in instants], axis=0)
+        first, *others = self._integrator.instants(dt)
+        placed = self._supports.placed
+        self._prescribed = self._supports.velocities(time + first).copy()
+        if others:
+            every = [self._prescribed, *(self._supports.velocities(time + t).copy() for t in others)]
+            self._prescribed = np.mean(every, axis=0)
         if len(placed):
             there = self.comm, self.layout, self._integrator, self._motion()
             self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)

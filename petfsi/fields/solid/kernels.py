@@ -126,7 +126,10 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                         s = 0.0
                         for J in range(dim):
                             s += g[a, J] * Cg[i, k, J]
-                        K[a, b, i, k] += s
+                        if plain:  # the only point
+                            K[a, b, i, k] = s
+                        else:
+                            K[a, b, i, k] += s
 
     @njit(inline="always")
     def close(K):
@@ -163,7 +166,8 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
         g, Cg = np.empty((nodes, dim)), np.empty((dim, dim, dim))
         K = np.empty((nodes, nodes, dim, dim))
         for e in range(cells.shape[0]):
-            clear(K)
+            if not plain:
+                clear(K)
             for q in range(n_points):
                 shape_gradients(basis[e], table[q], g)
                 add_stiffness(g, C[e * n_points + q], A_K * w[e, q], Cg, K)

@@ -35,7 +35,6 @@ class LumpedEquation:
     ) -> None:  # fmt: skip
         self.mass = mass
         self._mass_damping, self._stiffness_damping = mass_damping[:, None], stiffness_damping[:, None]
-        self._damped = bool(np.any(stiffness_damping))
         self._chosen = np.flatnonzero((held >= layout.start) & (held < layout.end))
         self._held = held[self._chosen] - layout.start
         self.indptr = np.arange(layout.n_local + 1, dtype=IntType)
@@ -51,9 +50,9 @@ class LumpedEquation:
         """Return (a + a0) M w, shape (n_owned, width), N."""
         return (a + self._mass_damping) * self.mass * w
 
-    def lag(self, velocity: np.ndarray) -> np.ndarray | None:
-        """Return s = a1 u^n, of which K' s is the force of stiffness damping; None if there is none."""
-        return self._stiffness_damping * velocity if self._damped else None
+    def lag(self, velocity: np.ndarray) -> np.ndarray:
+        """Return s = a1 u^n, of which K' s is the force of stiffness damping."""
+        return self._stiffness_damping * velocity
 
     def prescribe(self, b: np.ndarray, a: float, mean: float, g: np.ndarray) -> None:
         """Put the prescribed values g of all held unknowns into this rank's right-hand side."""

@@ -57,16 +57,17 @@ def _compile(dim):
                         B[i, j] += F[i, k] * F[j, k]
             if not tangent:
                 continue
+            shear = mu[e]
             for i in range(dim):
                 for J in range(dim):
+                    own = lame[e] * F[i, J]
                     for k in range(dim):
+                        crossed = shear * F[k, J]
                         for L in range(dim):
-                            c = lame[e] * F[i, J] * F[k, L] + mu[e] * F[i, L] * F[k, J]
-                            if i == k:
-                                c += S[J, L]
-                            if J == L:
-                                c += mu[e] * B[i, k]
-                            C[e, i, J, k, L] = c
+                            C[e, i, J, k, L] = own * F[k, L] + crossed * F[i, L]
+                        C[e, i, J, k, J] += shear * B[i, k]
+                    for L in range(dim):
+                        C[e, i, J, i, L] += S[J, L]
         return W, P, C
 
     return kernel
