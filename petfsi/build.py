@@ -2,31 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
 from mpi4py import MPI
 
 from petfsi.couplings.base import Coupling
 from petfsi.fields.base import Field, SolidField
+from petfsi.registry import COUPLINGS, FLUIDS, JOINT, SOLIDS, find
 from petfsi.scene.schema import Scene
-
-#: Where each kind of field and coupling lives; a new one is its file and a line here. Kinds of solids are joined.
-FLUIDS = {"mac": "petfsi.fields.mac.fluid:MacFluid"}
-SOLIDS = {
-    "simplex": "petfsi.fields.solid.solid:SimplexSolid",
-    "timoshenko": "petfsi.fields.beam.beam:BeamSolid",
-    "euler-bernoulli": "petfsi.fields.beam.beam:BeamSolid",
-}
-JOINT = "petfsi.fields.joint:JointSolid"
-COUPLINGS = {
-    "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
-    "ray": "petfsi.couplings.ray:RayCoupling",
-}
-
-
-def _class(place: str) -> type:
-    module, name = place.split(":")
-    return getattr(import_module(module), name)
 
 
 def build_fields(comm: MPI.Comm, scene: Scene) -> list[Field]:
@@ -35,7 +16,7 @@ def build_fields(comm: MPI.Comm, scene: Scene) -> list[Field]:
     if scene.solids:
         fields.append(_build_solid(comm, scene))
     if scene.fluid:
-        fields.append(_class(FLUIDS[scene.fluid.kind])(comm, scene))
+        fields.append(find(FLUIDS[scene.fluid.kind])(comm, scene))
     return fields
 
 
@@ -44,8 +25,8 @@ def _build_solid(comm: MPI.Comm, scene: Scene) -> SolidField:
     kinds = {name: solid.shape.beam.theory if solid.shape.beam else "simplex" for name, solid in scene.solids.items()}
     present = list(dict.fromkeys(kinds.values()))
     if len(present) == 1:
-        return _class(SOLIDS[present[0]])(comm, scene)
-    return _class(JOINT)(comm, scene, kinds, {kind: _class(SOLIDS[kind]) for kind in present})
+        return find(SOLIDS[present[0]])(comm, scene)
+    return find(JOINT)(comm, scene, kinds, {kind: find(SOLIDS[kind]) for kind in present})
 
 
 def build_couplings(scene: Scene, fields: list[Field]) -> list[Coupling]:
@@ -53,4 +34,4 @@ def build_couplings(scene: Scene, fields: list[Field]) -> list[Coupling]:
     if len(fields) < 2:
         return []
     solid, fluid = fields
-    return [_class(COUPLINGS[scene.coupling.transfer])(fluid, solid, scene.coupling)]
+    return [find(COUPLINGS[scene.coupling.transfer])(fluid, solid, scene.coupling)]

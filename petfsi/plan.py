@@ -189,7 +189,8 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
 def _plain_cells(solid: Solid) -> list[int] | None:
     """Return the cells per axis of a box or ball about which only what the scene alone shows can be wrong."""
     shape = solid.shape
-    if shape.cavity is not None or any(not isinstance(support.where, str) for support in solid.supports):
+    places = [support.where for support in solid.supports] + [load.where for load in solid.loads]
+    if shape.cavity is not None or not all(isinstance(where, str) for where in places):
         return None
     if shape.ball is not None and shape.ball.cells is not None:
         return [shape.ball.cells] * len(shape.ball.centre)

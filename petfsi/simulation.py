@@ -197,6 +197,7 @@ class Simulation:
         values = dict(zip((field.name for field in self.fields), self.system.values(), strict=True))
         if self.solid:
             self._check_speed(self.solid, values["solid"], dt)
+            self.solid.judge(values["solid"], dt)
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
             coupling.accept(t, dt)

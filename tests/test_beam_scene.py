@@ -117,6 +117,11 @@ def test_a_mistake_is_named_with_its_key_and_what_is_allowed(sets, key, allowed)
     assert len(found) == 1, caught.value
 
 
+@pytest.mark.parametrize("shape", [BOX, beam(more=", theory = 'euler-bernoulli'")], ids=["block", "another theory"])
+def test_a_scene_may_have_several_kinds_of_solids(shape):
+    assert "(gate 9 nodes, 4 cells; other " in describe_plan(scene_from_dict(gate(other(shape))))
+
+
 def test_a_beam_needs_a_plane():
     data = gate("dim=3")
     del data["fluid"], data["probes"]

@@ -287,6 +287,16 @@ def test_the_plan_counts_the_middle_nodes_of_quadratic_elements(dim, where):
     assert f"block {nodes} nodes" in describe_plan(scene) and nodes == [35, 105][dim - 2]
 
 
+def test_the_plan_finds_loads_that_are_nowhere():
+    box = {"origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [2, 3]}
+    block = {"shape": {"box": box}, "density": 1.0, "young": 1.0, "poisson": 0.0}
+    block["loads"] = [{"at": [3.0, 0.0], "force": [1.0, 0.0]}, {"at": [1.0, 0.1], "force": [1.0, 0.0]}]
+    scene = scene_from_dict({"dim": 2, "time": {"end": 1.0, "dt": 0.1}, "solids": {"block": block}})
+    with pytest.raises(InputError, match=r"solids.block.loads.0.at = \[3.0, 0.0\]: lies 2 m away") as told:
+        describe_plan(scene)
+    assert len(str(told.value).splitlines()) == 1
+
+
 @pytest.mark.parametrize("cells, named", [(24, "monolithic.opts"), (26, "solid-large.opts")])
 def test_a_large_solid_alone_is_solved_by_multigrid(cells, named):
     box = {"origin": [0.0, 0.0, 0.0], "size": [1.0, 1.0, 1.0], "cells": [cells] * 3}

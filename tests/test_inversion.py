@@ -151,3 +151,19 @@ def test_an_inverted_neohookean_element_is_an_error_on_all_ranks():
         with pytest.raises(SolveError, match="nan"):
             sim.prepare()
             sim.advance()
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("more", [{}, {"elements": "quadratic"}, {"volumetric": "reduced"}], ids=str)
+def test_a_step_that_turns_another_material_inside_out_is_refused_by_name(more):
+    thrown = scene("bdf2", "exact", initial=STARTS["squeezed"], material="green", **more)
+    with only_options(["-options_file", "monolithic.opts"]):
+        sim = Simulation(MPI.COMM_WORLD, thrown)
+        sim.prepare()
+        told = []
+        sim.report = told.append
+        with pytest.raises(SolveError, match="solids.block has turned an element inside out: det F = -"):
+            for _ in range(20):
+                sim.advance()
+    assert len(told) >= 3 and sim.solid.quality() > 0
+    assert all("solids.block has turned an element inside out" in text for text in told[:3])

@@ -327,9 +327,9 @@ def test_light_bodies_of_all_parts_have_motions():
 def test_a_run_resumes_bit_for_bit_and_is_drawn(tmp_path):
     scene = tmp_path / "basins.toml"
     scene.write_text(dump_scene(basins(wall=False)))
-    words = ["--set", "checkpoint.every=0.02", "--set", "output.every=0.05", "--set", "time.end=0.1"]
+    words = ["--set", "checkpoint.every=0.02", "--set", "output.every=0.02", "--set", "time.end=0.06"]
     petfsi("run", scene, "--out", tmp_path / "whole", *words)
-    petfsi("run", scene, "--out", tmp_path / "parts", *words, "--steps", 5)
+    petfsi("run", scene, "--out", tmp_path / "parts", *words, "--steps", 3)
     petfsi("resume", tmp_path / "parts")
     want, got = last_output(tmp_path / "whole"), last_output(tmp_path / "parts")
     assert want.keys() == got.keys()

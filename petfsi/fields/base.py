@@ -251,6 +251,16 @@ class SolidField(Field):
     def stable_step(self) -> float:
         """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
 
+    def judge(self, x: np.ndarray, dt: float) -> None:
+        """Raise unless the solution x (SI) of a step of dt can be accepted. Collective.
+
+        Raises
+        ------
+        SolveError
+            On all ranks.
+        """
+        return
+
     @abstractmethod
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""

@@ -80,7 +80,9 @@ class JointSolid(SolidField):
         """Return the largest side of the bounding box of all bodies at rest, m. Collective."""
         x = np.concatenate([part.reference for part in self.parts])
         ends = np.stack((x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)))
-        return float(self.comm.allreduce(ends, MPI.MAX).sum(axis=0).max())
+        whole = np.empty_like(ends)
+        self.comm.Allreduce(ends, whole, MPI.MAX)
+        return float(whole.sum(axis=0).max())
 
     def _set_block(self) -> None:
         rows = [part.rows for part in self.parts]
@@ -160,6 +162,11 @@ class JointSolid(SolidField):
         """Measure the rows of all parts against this mass, kg."""
         for part in self.parts:
             part.set_scale(reference_mass)
+
+    def judge(self, x: np.ndarray, dt: float) -> None:
+        """Let every part judge its own. Collective."""
+        for part, mine in self._split(x):
+            part.judge(mine, dt)
 
     def stable_step(self) -> float:
         """Return the shortest of the parts' stable steps, s. Collective."""

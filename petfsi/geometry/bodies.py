@@ -72,9 +72,20 @@ def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
         try:
             if load.where is not None:
                 located_facets(load.where, points, facets, f"{key}.loads.{n}", tags)
+            if load.at is not None:
+                _check_near(np.array(load.at), mesh, f"{key}.loads.{n}")
         except InputError as error:
             mistakes.append(str(error))
     return mistakes
+
+
+def _check_near(at: np.ndarray, mesh: Mesh, key: str) -> None:
+    """Raise if a point is farther from every node than the longest edge: then it is in no element either."""
+    points, cells = mesh
+    edges = np.linalg.norm(points[cells] - points[np.roll(cells, 1, axis=1)], axis=-1)
+    distance = float(np.linalg.norm(points - at, axis=1).min())
+    if distance > edges.max():
+        raise InputError(f"{key}.at = {at.tolist()}: lies {distance:g} m away from the solid's nearest node")
 
 
 def _held_points(solid: Solid, points: np.ndarray) -> np.ndarray:

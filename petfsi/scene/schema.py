@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,6 +26,9 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from petfsi.integrators import INTEGRATORS
+from petfsi.registry import COUPLINGS, FLUIDS, MATERIALS
+
 
 def _number_or_text(value: Any) -> Any:
     """Refuse what is neither a finite number nor a text, in one message rather than one per type."""
@@ -33,6 +37,19 @@ def _number_or_text(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise PydanticCustomError("number_or_text", "must be a finite number")
     return value
+
+
+def _one_of(names: Collection[str]) -> Callable[[Any], str]:
+    """Return a validator of names that are registered elsewhere, which speaks as those of literals do."""
+    quoted = [f"'{name}'" for name in names]
+    expected = " or ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
+
+    def known(value: Any) -> str:
+        if not isinstance(value, str) or value not in names:
+            raise PydanticCustomError("literal_error", "Input should be {expected}", {"expected": expected})
+        return value
+
+    return known
 
 
 #: TOML has types, so a text is no number, and neither is true.
@@ -58,7 +75,7 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Number, Field(description="s")]
-    integrator: Literal["newmark", "bdf2", "midpoint", "symplectic-euler", "static"] = "newmark"
+    integrator: Annotated[str, BeforeValidator(_one_of(INTEGRATORS))] = "newmark"
     above_limit: Annotated[
         Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
     ] = "refuse"
@@ -204,7 +221,7 @@ class FluidInitial(Table):
 class Fluid(Table):
     """An incompressible fluid on a regular staggered grid."""
 
-    kind: Literal["mac"] = "mac"
+    kind: Annotated[str, BeforeValidator(_one_of(FLUIDS))] = "mac"
     density: Annotated[Real, Field(gt=0, description="kg/m^3")]
     viscosity: Annotated[Real, Field(description="Pa s")] = 0.0
     origin: Annotated[Vector, Field(description="m")]
@@ -306,7 +323,7 @@ class Solid(Table):
     density: Annotated[Real, Field(gt=0, description="kg/m^3")]
     young: Annotated[Real, Field(gt=0, description="Pa")]
     poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
-    material: Literal["green", "neohookean", "stable-neohookean", "linear"] = "green"
+    material: Annotated[str, BeforeValidator(_one_of(MATERIALS))] = "green"
     tangent: Annotated[
         Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
     ] = "exact"
@@ -338,7 +355,7 @@ class Obstacle(Table):
 class Coupling(Table):
     """How fluid and solids are joined."""
 
-    transfer: Literal["cutcell", "ray"] = "cutcell"
+    transfer: Annotated[str, BeforeValidator(_one_of(COUPLINGS))] = "cutcell"
     #: Facets are split until their pieces are about a cell / quadrature.
     quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
 

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from petfsi.fields.solid.kernels import kernels
-from petfsi.fields.solid.materials import Material, linear
+from petfsi.fields.solid.materials import Material
+from petfsi.fields.solid.materials.linear import linear
 from petfsi.fields.solid.partition import LocalMesh
 from petfsi.fields.solid.patches import barycentric_gradients
 from petfsi.fields.solid.pattern import Pattern
+from petfsi.fields.solid.quality import smallest_volume_ratio
 from petfsi.fields.solid.rules import Rule, linear_rule, patch_rule, quadratic_rule
 from petfsi.geometry.meshes import Group
 
@@ -279,11 +281,10 @@ class Elements:
                 power += float(weights @ ((P + (k + a1) * stress) * slope).sum(axis=(1, 2)))
         return damping, power
 
-    def smallest_ratio(self, d: np.ndarray) -> float:
-        """Return the smallest det F of this rank's quadrature points."""
-        least = np.inf
+    def smallest_ratios(self, d: np.ndarray) -> np.ndarray:
+        """Return the smallest det F of each body at this rank's quadrature points, infinite where it has none."""
+        least = np.full(len(self.bodies.density), np.inf)
         for batch in self.batches:
             for part in batch.parts():
-                F = np.eye(self.dim) + batch.gradients(d, part)
-                least = min(least, float(np.linalg.det(F).min()))
+                least[batch.body] = min(least[batch.body], smallest_volume_ratio(batch.gradients(d, part)))
         return least

@@ -316,13 +316,17 @@ class NodalSolid(SolidField):
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the velocities w and move the nodes."""
-        w, motion = x.reshape(-1, self.width).copy(), self._motion()
-        stage = self._stage or self._integrator.stage(motion, dt)
-        motion = self._integrator.finish(motion, stage, w, dt)
+        motion = self._arrival(x, dt)
         self.moved = (motion.displacement - self.displacement).ravel()
         self.displacement, self.velocity = motion.displacement, motion.velocity
         self._past, self._past_dt = motion.past, motion.past_dt
         self._stage = self._geometry = None
+
+    def _arrival(self, x: np.ndarray, dt: float) -> Motion:
+        """Return the motion at the end of the step with the velocities w."""
+        motion = self._motion()
+        stage = self._stage or self._integrator.stage(motion, dt)
+        return self._integrator.finish(motion, stage, x.reshape(-1, self.width).copy(), dt)
 
     def _motion(self) -> Motion:
         return Motion(self.displacement, self.velocity, self._past, self._past_dt)

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from petfsi.errors import InputError
+from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
 from petfsi.fields.solid.elements import Bodies, Elements
 from petfsi.fields.solid.field import NodalSolid
@@ -23,6 +23,7 @@ from petfsi.geometry.quadratic import with_middles
 from petfsi.geometry.surfaces import Surface, boundary_facets, shells, signed_volumes
 from petfsi.petsc import IntType
 from petfsi.ranks import on_root
+from petfsi.registry import INVERTIBLE
 from petfsi.scene.schema import Scene, Solid
 
 
@@ -43,6 +44,7 @@ class SimplexSolid(NodalSolid):
         }
         self._surface = self._make_surface(mesh, scene.solids)
         self._places: dict[tuple[str, tuple[float, ...]], Place] = {}
+        self._must_not_invert = np.array([solid.material not in INVERTIBLE for solid in scene.solids.values()])
 
     def _make_elements(self, solids: Mapping[str, Solid]) -> Elements:
         return Elements(self._mesh, _bodies(solids))
@@ -140,9 +142,30 @@ class SimplexSolid(NodalSolid):
     # ---- what others read -------------------------------------------------------------------------------------
 
     def quality(self) -> float:
-        """Return the smallest det F where stress is taken: 1 at rest, 0 or less if inverted. Collective."""
-        least = self._elements.smallest_ratio(self._with_shared(self.displacement))
-        return self.comm.allreduce(least, MPI.MIN)
+        """Return the smallest det F: 1 at rest, 0 or less where an element is inverted. Collective."""
+        return float(self._smallest_ratios(self.displacement).min())
+
+    def judge(self, x: np.ndarray, dt: float) -> None:
+        """Raise if an element of a material that is not made for it turns inside out. Collective.
+
+        Explicit steps are not judged: what they do to an element takes many of them, and shows in the stable step.
+        """
+        if self.explicit or not np.any(self._must_not_invert):
+            return
+        there = self._arrival(x, dt).displacement
+        least = np.where(self._must_not_invert, self._smallest_ratios(there), np.inf)
+        if np.min(least) <= 0:
+            name = self.names[int(np.argmin(least))]
+            raise SolveError(
+                f"solids.{name} has turned an element inside out: det F = {np.min(least):.1e}. What comes of that is "
+                f'no motion of its material; smaller steps, more damping, or material = "stable-neohookean"'
+            )
+
+    def _smallest_ratios(self, displacement: np.ndarray) -> np.ndarray:
+        """Return the smallest det F of each body on any rank. Collective."""
+        least = self._elements.smallest_ratios(self._with_shared(displacement))
+        self.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
+        return least
 
     def volumes(self) -> dict[str, float]:
         """Return the volume that each body's surface encloses, m^3 (m^2 in 2D). Collective."""

@@ -15,37 +15,19 @@ so that the two parts can be integrated by different rules. Where a material bre
 energy is infinite and stress and tangent are not numbers, without a warning: whoever solves sees a residual that is
 none.
 
-A new material is a file beside these and a line in ``MATERIALS``.
+A new material is a file beside these and a line in ``petfsi.registry``.
 """
 
 from __future__ import annotations
 
-from petfsi.fields.solid.materials.green import green
+from petfsi import registry
 from petfsi.fields.solid.materials.kinematics import Material
-from petfsi.fields.solid.materials.linear import linear
-from petfsi.fields.solid.materials.neohookean import neohookean
 from petfsi.fields.solid.materials.projection import project, projected
-from petfsi.fields.solid.materials.stable import stable_neohookean
 
-__all__ = [
-    "MATERIALS",
-    "Material",
-    "green",
-    "lame_parameters",
-    "linear",
-    "neohookean",
-    "project",
-    "projected",
-    "stable_neohookean",
-]
+__all__ = ["MATERIALS", "Material", "lame_parameters", "project", "projected"]
 
 #: The scene's ``solids.*.material`` by name.
-MATERIALS: dict[str, Material] = {
-    "green": green,
-    "linear": linear,
-    "neohookean": neohookean,
-    "stable-neohookean": stable_neohookean,
-}
+MATERIALS: dict[str, Material] = {name: registry.find(place) for name, place in registry.MATERIALS.items()}
 
 
 def lame_parameters(young: float, poisson: float) -> tuple[float, float]:
