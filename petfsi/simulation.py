@@ -152,7 +152,6 @@ class Simulation:
     def forget(self) -> None:
         """Forget what a resumed run could not know: it must go on in the same way. Collective."""
         self.solver.reset()
-        self.stable.forget()
 
     def prepare(self) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
@@ -260,9 +259,13 @@ class Simulation:
         }
 
     def state(self) -> dict[str, dict[str, Slab]]:
-        """Return all that the next step reads, by field, and what accounts add to."""
-        accounts = {"accounts": self.accounts.state()} if self.accounts.columns else {}
-        return {field.name: field.state() for field in self.fields} | accounts
+        """Return all that the next step reads, by field, what accounts add to, and the stable step."""
+        states = {field.name: field.state() for field in self.fields}
+        if self.accounts.columns:
+            states["accounts"] = self.accounts.state()
+        if self.stable.limited:
+            states["stable"] = self.stable.state(self.comm)
+        return states
 
     def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:
         """Take up the state of a checkpoint; ``prepare`` comes first. Collective.
@@ -278,3 +281,5 @@ class Simulation:
             field.restore(group(field.name))
         if self.accounts.columns:
             self.accounts.restore(group("accounts"))
+        if self.stable.limited:
+            self.stable.restore(group("stable"))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+from mpi4py import MPI
+
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import SolidField
+from petfsi.fields.base import Reader, Slab, SolidField, scalar_slab
 from petfsi.scene.schema import Time
 
 #: The stable step is found anew after so many steps at most,
@@ -21,10 +23,10 @@ MOST = 100_000
 class StableStep:
     """Keeps a step below the stable one, as ``time.above_limit`` says.
 
-    Finding the stable step costs some 30 steps. It is found before the first step, every ``EVERY`` steps, after
-    ``forget``, and when the body may have changed too much since: the ends of an edge can have moved apart by twice
-    the way of the fastest node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once
-    is enough where it never changes.
+    Finding the stable step costs some 30 steps. It is found before the first step, every ``EVERY`` steps, and when
+    the body may have changed too much since: the ends of an edge can have moved apart by twice the way of the fastest
+    node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once is enough where it never
+    changes. A run that goes on knows the one last found: else it might divide its steps otherwise.
 
     Parameters
     ----------
@@ -51,10 +53,6 @@ class StableStep:
     def divides(self) -> bool:
         """Whether a step may be divided."""
         return self.limited and self._subcycles
-
-    def forget(self) -> None:
-        """Find the stable step anew before the next step."""
-        self._steps = EVERY
 
     def count(self, t: float, dt: float) -> int:
         """Return into how many equal steps one of length dt that begins at t must be divided. Collective.
@@ -97,3 +95,13 @@ class StableStep:
         assert self._solid is not None
         if not self._solid.is_linear:
             self._steps, self._way = self._steps + 1, self._way + way
+
+    def state(self, comm: MPI.Comm) -> dict[str, Slab]:
+        """Return what tells when the stable step is found anew; the field keeps where it was found."""
+        numbers = {"limit": self.limit, "steps": self._steps, "way": self._way, "stretch": self._stretch}
+        return {name: scalar_slab(comm, value) for name, value in numbers.items()}
+
+    def restore(self, read: Reader) -> None:
+        """Take the state back. Collective."""
+        limit, steps, way, stretch = (float(read(name, (0,), (1,))[0]) for name in ("limit", "steps", "way", "stretch"))
+        self.limit, self._steps, self._way, self._stretch = limit, int(steps), way, stretch

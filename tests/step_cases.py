@@ -10,6 +10,8 @@ from petfsi.scene.load import load_scene
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 
+#: How a block is thrown.
+SWING = {"velocity": ["0.5*x", "1.5*x"]}
 LEFT = [{"where": "left", "fix": ["x", "y"]}]
 
 
@@ -53,3 +55,18 @@ def motion(sim):
     """Return displacements and velocities of all nodes in natural order, the same on every rank."""
     parts = sim.comm.allgather([sim.solid.state()[name].data for name in ("displacement", "velocity")])
     return np.concatenate([np.concatenate([part[n] for part in parts]) for n in range(2)])
+
+
+def stored(sim):
+    """Return the whole state by group and name, the same on every rank."""
+    return {
+        group: {name: _joined(sim.comm.allgather((slab.start, slab.data)), slab.shape) for name, slab in slabs.items()}
+        for group, slabs in sim.state().items()
+    }
+
+
+def _joined(pieces, shape):
+    whole = np.full(shape, np.nan)
+    for start, data in pieces:
+        whole[tuple(slice(a, a + n) for a, n in zip(start, data.shape, strict=True))] = data
+    return whole

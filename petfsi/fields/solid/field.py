@@ -133,6 +133,7 @@ class NodalSolid(SolidField):
         placed = self._supports.placed
         here = here[placed]
         self.displacement.reshape(-1)[held[placed][here] - self.layout.start] = self._supports.displacements(0.0)[here]
+        self._measured = self.displacement.copy()
 
     @cached_property
     def _pattern(self) -> Pattern:
@@ -283,7 +284,8 @@ class NodalSolid(SolidField):
         """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
         if self._lumped is None:
             return np.inf
-        d = self._measured = self._with_shared(self.displacement)
+        self._measured = self.displacement.copy()
+        d = self._with_shared(self._measured)
         rest, free = np.zeros_like(d), ~self._is_held[: self._mesh.n_owned]
         here, there = np.empty_like(self.displacement), np.empty_like(self.displacement)
         self._elements.forces(State(d, rest, rest), here)
@@ -301,7 +303,7 @@ class NodalSolid(SolidField):
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
         start, end, length = self._edges
-        change = self._with_shared(self.displacement) - self._measured
+        change = self._with_shared(self.displacement - self._measured)
         change = np.abs(change[end] - change[start])
         change[:, : self.dim] /= length[:, None]
         return self.comm.allreduce(float(change.max(initial=0.0)), MPI.MAX)
@@ -423,9 +425,16 @@ class NodalSolid(SolidField):
         return {"kinetic": float(total[0]), "elastic": float(total[1])}
 
     def state(self) -> dict[str, Slab]:
-        """Return displacement, velocity and what the integrator remembers, in the mesh's own order. Collective."""
+        """Return displacement, velocity and what the integrator remembers, in the mesh's own order. Collective.
+
+        Of an explicit scheme also where its stable step was found.
+        """
         past = dict(zip(self._integrator.past, map(self._natural_rows, self._past), strict=True))
-        return self._present() | past | ({"past_dt": scalar_slab(self.comm, self._past_dt)} if past else {})
+        if past:
+            past["past_dt"] = scalar_slab(self.comm, self._past_dt)
+        if self._lumped is not None:
+            past["displacement_measured"] = self._natural_rows(self._measured)
+        return self._present() | past
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
@@ -438,6 +447,8 @@ class NodalSolid(SolidField):
         self._past = tuple(nodes(name) for name in self._integrator.past)
         if self._past:
             self._past_dt = float(read("past_dt", (0,), (1,))[0])
+        if self._lumped is not None:
+            self._measured = nodes("displacement_measured")
         self._stage = self._geometry = None
 
     def _present(self) -> dict[str, Slab]:
