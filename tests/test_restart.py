@@ -1,4 +1,4 @@
-"""A checkpoint holds all that the next step reads: runs that go on repeat, bit for bit, those never stopped. About 10 s.
+"""A checkpoint holds all that the next step reads: runs that go on repeat, bit for bit, those never stopped.
 
 In one process, so that every integrator, solver and kind of solid can be had; through the command: ``test_run``.
 """
