@@ -16,6 +16,10 @@ from petfsi.system import System
 #: Linearise once, or iterate.
 KINDS = ("ksponly", "newtonls")
 
+#: What a linear solve leaves over, as of a tangent near singular, the next iteration sees: it may be so many times what
+#: the solver was asked for.
+SLACK = 1e4
+
 
 class LinearSolver(Protocol):
     """What solves the linear systems."""
@@ -24,8 +28,8 @@ class LinearSolver(Protocol):
         """Follow the operator's new values. Collective."""
         ...
 
-    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> tuple[int, dict[str, float]]:
-        """Solve for x, from zero; return iterations and residuals. Collective."""
+    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec, slack: float) -> tuple[int, dict[str, float]]:
+        """Solve for x, from zero, to a multiple of the tolerance; return iterations and residuals. Collective."""
         ...
 
 
@@ -181,7 +185,7 @@ class Newton:
             self.solver.set_up()
             self._changed = False
         y.set(0.0)
-        self._iterations += self.solver.solve_linear(f, y)[0]
+        self._iterations += self.solver.solve_linear(f, y, SLACK)[0]
 
     def _story(self, norms: dict[str, float]) -> str:
         system, snes = self.system, self.snes

@@ -291,8 +291,14 @@ class Solver:
             self._newton = Newton(self.system, self, PREFIX, STATICS if self._static else DYNAMICS)
         return self._newton
 
-    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> tuple[int, dict[str, float]]:
+    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec, slack: float = SLACK) -> tuple[int, dict[str, float]]:
         """Solve for x, from what it holds, with the operator as it was set up. Collective.
+
+        Parameters
+        ----------
+        b, x : PETSc.Vec
+        slack : float
+            How far the true residual may lie above the tolerance that the solver itself tested.
 
         Returns
         -------
@@ -314,16 +320,16 @@ class Solver:
         except PETSc.Error as error:
             raise SolveError(f"solver '{self.prefix}' broke down: {petsc_text(error)}") from None
         norms = self.system.update_residual(x, b)
-        self._judge(ksp, norms)
+        self._judge(ksp, norms, slack)
         return max(self._inner_iterations, ksp.getIterationNumber()), norms
 
-    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float]) -> None:
+    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
         solvers = [ksp, *self._sub_solvers(ksp)]
         iterative = [s.getTolerances()[0] for s in solvers if s.getType() != PETSc.KSP.Type.PREONLY]
         outer = ksp.getType() != PETSc.KSP.Type.PREONLY
         rtol = iterative[0] if outer else max(iterative, default=1e-8)
-        wanted = SLACK * rtol * norms["rhs"]
+        wanted = slack * rtol * norms["rhs"]
         failed = [s for s in solvers if s.getConvergedReason() < 0]
         finite = np.isfinite(norms[""])
         if self.fixed_iterations:
