@@ -61,10 +61,15 @@ def test_the_energy_of_a_nonlinear_swing_stays_where_newton_iterates():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("material, swing, drift", [("neohookean", 0.02, 0.01), ("green", 0.04, 0.01)])
-def test_the_energy_of_a_nonlinear_swing_stays_for_long(material, swing, drift):
-    seen = energies(material, 0.05, 10_000, *NEWTON)
-    assert np.abs(seen - 1).max() < swing and abs(seen[-500:].mean() - seen[:500].mean()) < drift
+@pytest.mark.parametrize(
+    "material, dt, options, swing",
+    [("neohookean", 0.05, NEWTON, 0.02), ("green", 0.05, NEWTON, 0.04)]
+    + [("neohookean", 0.025, (), 0.01), ("green", 0.025, (), 0.01)],
+)
+def test_the_energy_of_a_nonlinear_swing_stays_for_long(material, dt, options, swing):
+    """Linearised once a step it drifts: at 0.05 s by 11 % and 33 %."""
+    seen = energies(material, dt, 10_000, *options)
+    assert np.abs(seen - 1).max() < swing and abs(seen[-500:].mean() - seen[:500].mean()) < 0.01
 
 
 @pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
