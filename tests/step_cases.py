@@ -26,6 +26,7 @@ def block(cells=(1, 1), size=(1.0, 1.0), time=None, gravity=None, output=None, *
             "dim": 2,
             "time": {"end": 1.0, "dt": 0.1} | (time or {}),
             "gravity": gravity,
+            "output": output or {},
             "solids": {"block": body | solid},
         }
     )

@@ -22,8 +22,6 @@ from petfsi.solve import shipped_options
 
 SCENES = Path(__file__).parent / "scenes"
 BAR = SCENES / "bar2d.toml"
-#: So that an explicit step takes not too many sub-steps.
-HEAVY_BAR = ("--set", "time.above_limit=subcycle", "--set", "solids.bar.density=2000", "--set", "solids.bar.damping={}")
 PETFSI = Path(sys.executable).with_name("petfsi")
 
 
@@ -112,17 +110,12 @@ def test_a_killed_run_resumes_bit_for_bit(ranks, straight, tmp_path):
     assert (straight(ranks) / "history.csv").read_bytes() == (tmp_path / "run" / "history.csv").read_bytes()
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize(
-    "integrator, dt, options",
-    [
-        ("newmark", "(1 + t)/40", ()),
-        ("bdf2", "(1 + 0.4*sin(20*t))/30", ()),
-        ("midpoint", "(1 + 0.4*sin(20*t))/30", ("-fsi_snes_type", "newtonls")),
-        ("symplectic-euler", "(1 + 0.4*sin(20*t))/30", HEAVY_BAR),
-    ],
+    "ranks, integrator, options", [(1, "midpoint", ("-fsi_snes_type", "newtonls")), (2, "bdf2", ())]
 )
-def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, options, ranks, tmp_path):
+def test_a_stopped_run_goes_on_bit_for_bit(ranks, integrator, options, tmp_path):
+    """Of so light a bar, whose preconditioner is made in every step; all others stop as in ``test_restart``."""
+    dt = "(1 + 0.4*sin(20*t))/30"
     sets = (*options, "--set", f"time.integrator={integrator}", "--set", f"time.dt='{dt}'", "--set", "time.end=0.3")
     sets = (*sets, "--set", "checkpoint.every=0.11")
     for name, steps in (("straight", ()), ("stopped", ("--steps", 6))):
@@ -139,8 +132,7 @@ def test_a_stopped_run_goes_on_bit_for_bit_with_any_integrator(integrator, dt, o
     assert 0.3 <= history["time"][-1] < 0.3 + history["dt"][-1] and np.ptp(history["dt"][1:]) > 0.005
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("integrator", ["static", "symplectic-euler"])
+@pytest.mark.parametrize("ranks, integrator", [(2, "static"), (1, "symplectic-euler")])
 def test_a_stopped_run_of_a_solid_alone_goes_on_bit_for_bit(integrator, ranks, tmp_path):
     """In statics under a growing load; explicitly in sub-steps whose number changes."""
     texts = {
@@ -165,7 +157,7 @@ def test_a_stopped_run_of_a_solid_alone_goes_on_bit_for_bit(integrator, ranks, t
     assert len(history["step"]) > 12 and history[column].max() > 1 and abs(history["tip.y"][-1]) > 1e-3
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("ranks", [2])
 def test_divided_cells_go_on_bit_for_bit(ranks, tmp_path):
     for name, steps in (("straight", ()), ("stopped", ("--steps", 9))):
         petfsi("run", SCENES / "sheet.toml", "--out", tmp_path / name, *steps, ranks=ranks)

@@ -387,7 +387,7 @@ class NodalSolid(SolidField):
         both = self._with_shared(np.concatenate((self.displacement, self.velocity), axis=1))
         d, u = both[:, : self.width], both[:, self.width :]
         kinetic, elastic = self._elements.energies(d, u, self._mesh.counted)
-        return Stock(np.tensordot(self._uniform, self.velocity), kinetic, elastic)
+        return Stock(self._uniform.reshape(self.dim, -1) @ self.velocity.ravel(), kinetic, elastic)
 
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted.
@@ -398,7 +398,7 @@ class NodalSolid(SolidField):
         if self._loaded is None:
             return Work()
         stage, state, gravity = self._loaded
-        weight = np.tensordot(gravity, self._uniform, axes=1)
+        weight = (gravity @ self._uniform.reshape(self.dim, -1)).reshape(self.velocity.shape)
         fallen, loaded = float(np.vdot(weight, self.moved)), 0.0
         if not self._loses and self._loads is None:
             return Work(gravity=fallen)
