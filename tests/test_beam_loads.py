@@ -259,7 +259,7 @@ def test_loads_work_on_the_way_of_their_points(theory):
             {"where": "end", "traction": [1.0, 0.0]},
             r"loads.0.where: none of the 6 boundary facets .of a beam: elements. lies",
         ),
-        ({"at": [5.0, 0.0], "force": [1.0, 0.0]}, r"solids.b.loads.0: \[5, 0\] lies .* m from the axis of solids.b"),
+        ({"at": [5.0, 0.0], "force": [1.0, 0.0]}, r"solids.b.loads.0.at = \[5.0, 0.0\]: lies .* m away from the solid"),
     ],
 )
 def test_a_load_beside_the_beam_is_refused(load, said):

@@ -292,3 +292,14 @@ def test_memory_does_not_grow_with_the_steps():
             sim.advance()
     # what a step makes and drops is about 50 kB here
     assert used() - before < 2e6
+
+
+@pytest.mark.parametrize("scene, name", [(BAR, "bar"), (SCENES / "beam.toml", "strip")], ids=["coupled", "alone"])
+@pytest.mark.parametrize("material", ["neohookean", "stable-neohookean"])
+def test_a_second_process_compiles_nothing(scene, name, material, tmp_path, monkeypatch):
+    """Compiled loops are kept on disk; a closure over another compiled function would be compiled anew every time."""
+    monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")
+    for _ in range(2):
+        words = ("--steps", 2, "--set", f"solids.{name}.material={material}")
+        said = petfsi("run", scene, "--out", tmp_path / "out", "--overwrite", *words)
+    assert "[cache] data loaded" in said and "[cache] data saved" not in said

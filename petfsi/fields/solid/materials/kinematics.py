@@ -80,5 +80,16 @@ def log_excess(x):
     return x * y - 2 * y * tail
 
 
-COFACTOR = {2: cofactor_2d, 3: cofactor_3d}
-HIGHER_INVARIANTS = {2: higher_invariants_2d, 3: higher_invariants_3d}
+@njit(cache=True, inline="always")
+def cofactor(F, cof, dim):
+    """Set cof = det(F) F^-T; a function of ``dim``, as a closure that holds compiled ones is not cached on disk."""
+    if dim == 2:
+        cofactor_2d(F, cof)
+    else:
+        cofactor_3d(F, cof)
+
+
+@njit(cache=True, inline="always")
+def higher_invariants(B, dim):
+    """Return det(I + B) - 1 - tr(B)."""
+    return higher_invariants_2d(B) if dim == 2 else higher_invariants_3d(B)

@@ -7,7 +7,7 @@ from math import log, log1p
 import numpy as np
 from numba import njit
 
-from petfsi.fields.solid.materials.kinematics import COFACTOR, HIGHER_INVARIANTS, log_excess, twice_green_strain
+from petfsi.fields.solid.materials.kinematics import cofactor, higher_invariants, log_excess, twice_green_strain
 
 
 def neohookean(
@@ -36,7 +36,6 @@ def neohookean(
 
 def _compile(dim):
     # dim as a constant of the closure lets the compiler unroll the loops over axes
-    cofactor, higher_invariants = COFACTOR[dim], HIGHER_INVARIANTS[dim]
 
     @njit(cache=True, error_model="numpy")
     def kernel(H, lame, mu, tangent):
@@ -52,7 +51,7 @@ def _compile(dim):
                 trace += B[i, i]
                 for j in range(dim):
                     F[i, j] = H[e, i, j] + (1.0 if i == j else 0.0)
-            cofactor(F, G)
+            cofactor(F, G, dim)
             J = 0.0
             for j in range(dim):
                 J += F[0, j] * G[0, j]
@@ -62,7 +61,7 @@ def _compile(dim):
                 if tangent:
                     C[e] = np.nan
                 continue
-            higher = higher_invariants(B)
+            higher = higher_invariants(B, dim)
             change = trace + higher  # J^2 - 1
             if change > -0.5:
                 log_J = 0.5 * log1p(change)

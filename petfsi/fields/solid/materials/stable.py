@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from petfsi.fields.solid.materials.kinematics import COFACTOR, HIGHER_INVARIANTS, log_excess, twice_green_strain
+from petfsi.fields.solid.materials.kinematics import cofactor, higher_invariants, log_excess, twice_green_strain
 
 
 def stable_neohookean(
@@ -32,36 +32,37 @@ def stable_neohookean(
     return _KERNELS[H.shape[1]](H, lame, mu, tangent)
 
 
+@njit(cache=True, inline="always")
+def _add_cofactor_tangent(factor, F, C, dim):
+    """Add factor dcof[i, J] / dF[k, L]: a component of F (in 2D one), with the signs of two permutations."""
+    for i in range(dim):
+        for k in range(dim):
+            if i == k:
+                continue
+            for J in range(dim):
+                for L in range(dim):
+                    if J == L:
+                        continue
+                    even = ((k - i) % 3 == 1) == ((L - J) % 3 == 1)
+                    c = factor if dim == 2 else factor * F[3 - i - k, 3 - J - L]
+                    C[i, J, k, L] += c if even else -c
+
+
+@njit(cache=True, inline="always")
+def _cofactor_change(H, change, dim):
+    """Set change = cof F - I."""
+    if dim == 3:
+        cofactor(H, change, dim)
+    else:
+        change[:] = 0.0
+    for i in range(dim):
+        for j in range(dim):
+            change[i, i] += H[j, j]
+            change[i, j] -= H[j, i]
+
+
 def _compile(dim):
     # dim as a constant of the closure lets the compiler unroll the loops over axes
-    cofactor, higher_invariants = COFACTOR[dim], HIGHER_INVARIANTS[dim]
-
-    @njit(cache=True)
-    def add_cofactor_tangent(factor, F, C):
-        """Add factor dcof[i, J] / dF[k, L]: a component of F (in 2D one), with the signs of two permutations."""
-        for i in range(dim):
-            for k in range(dim):
-                if i == k:
-                    continue
-                for J in range(dim):
-                    for L in range(dim):
-                        if J == L:
-                            continue
-                        even = ((k - i) % 3 == 1) == ((L - J) % 3 == 1)
-                        c = factor if dim == 2 else factor * F[3 - i - k, 3 - J - L]
-                        C[i, J, k, L] += c if even else -c
-
-    @njit(cache=True)
-    def cofactor_change(H, change):
-        """Set change = cof F - I."""
-        if dim == 3:
-            cofactor(H, change)
-        else:
-            change[:] = 0.0
-        for i in range(dim):
-            for j in range(dim):
-                change[i, i] += H[j, j]
-                change[i, j] -= H[j, i]
 
     @njit(cache=True, error_model="numpy")
     def kernel(H, lame, mu, tangent):
@@ -72,7 +73,7 @@ def _compile(dim):
         B, F, cof, change = np.empty((dim, dim)), np.empty((dim, dim)), np.empty((dim, dim)), np.empty((dim, dim))
         for e in range(n):
             twice_green_strain(H[e], B)
-            cofactor_change(H[e], change)
+            _cofactor_change(H[e], change, dim)
             trace = 0.0  # I - 3
             for i in range(dim):
                 trace += B[i, i]
@@ -82,7 +83,7 @@ def _compile(dim):
             J = 0.0
             for j in range(dim):
                 J += F[0, j] * cof[0, j]
-            higher = higher_invariants(B)
+            higher = higher_invariants(B, dim)
             # (J^2 - 1) / (J + 1) keeps the digits of a small change of volume
             grown = (trace + higher) / (J + 1) if J > 0.5 else J - 1
             bulk = lame[e] + 5 / 6 * mu[e]
@@ -101,7 +102,7 @@ def _compile(dim):
                         for L in range(dim):
                             C[e, i, j, k, L] = along * F[i, j] * F[k, L] + bulk * cof[i, j] * cof[k, L]
                     C[e, i, j, i, j] += mu[e] + stretched
-            add_cofactor_tangent(bulk * grown - mu[e], F, C[e])
+            _add_cofactor_tangent(bulk * grown - mu[e], F, C[e], dim)
         return W, P, C
 
     return kernel
