@@ -233,8 +233,6 @@ class SolidField(Field):
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
         By how much this rank's nodes moved in the step last accepted, m.
-    finest : float
-        Length of its shortest edge at rest, m.
     explicit : bool
         Whether its block is diagonal and its step limited, see ``stable_step``.
     is_linear : bool
@@ -243,9 +241,13 @@ class SolidField(Field):
 
     extent: float
     moved: np.ndarray
-    finest: float
     explicit: bool = False
     is_linear: bool = False
+
+    @property
+    @abstractmethod
+    def finest(self) -> float:
+        """Length of its shortest edge at rest, m. Collective at first."""
 
     @abstractmethod
     def stable_step(self) -> float:

@@ -60,7 +60,6 @@ class JointSolid(SolidField):
             self.parts.append(make(comm, scene.model_copy(update={"solids": own})))
         self.explicit = self.parts[0].explicit
         self.is_linear = all(part.is_linear for part in self.parts)
-        self.finest = min(part.finest for part in self.parts)
         self.extent = self._largest_side()
         counts = [part.layout.n_local for part in self.parts]
         ends = np.cumsum(counts)
@@ -167,6 +166,11 @@ class JointSolid(SolidField):
         """Let every part judge its own. Collective."""
         for part, mine in self._split(x):
             part.judge(mine, dt)
+
+    @property
+    def finest(self) -> float:
+        """Length of the shortest edge of any part at rest, m. Collective at first."""
+        return min(part.finest for part in self.parts)
 
     def stable_step(self) -> float:
         """Return the shortest of the parts' stable steps, s. Collective."""

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.lumped import LumpedEquation
@@ -70,7 +71,6 @@ class NodalSolid(SolidField):
         self.width = len(components)
         self.names = list(solids)
         self.extent = float(np.ptp(mesh.points, axis=0).max())
-        self.finest = _shortest_edge(mesh)
         self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
         self.explicit = self._integrator.explicit
         if self.explicit:
@@ -302,19 +302,16 @@ class NodalSolid(SolidField):
 
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
-        start, end, length = self._edges
-        change = self._with_shared(self.displacement - self._measured)
-        change = np.abs(change[end] - change[start])
-        change[:, : self.dim] /= length[:, None]
-        return self.comm.allreduce(float(change.max(initial=0.0)), MPI.MAX)
+        return self._edges.stretch(self._with_shared(self.displacement - self._measured))
 
     @cached_property
-    def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Both ends of every pair of nodes of this rank's elements, and their distance at rest, m."""
-        a, b = np.triu_indices(self._mesh.cells.shape[1], 1)
-        pairs = self._mesh.cells[:, np.stack((a, b), axis=1)].reshape(-1, 2)
-        start, end = np.unique(np.sort(pairs, axis=1), axis=0).T
-        return start, end, np.linalg.norm(self._mesh.points[end] - self._mesh.points[start], axis=1)
+    def _edges(self) -> Edges:
+        return Edges(self.comm, self._mesh)
+
+    @property
+    def finest(self) -> float:
+        """Length of the shortest edge at rest, m. Collective at first."""
+        return self._edges.shortest
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the velocities w and move the nodes."""
@@ -467,14 +464,6 @@ def _tags(scene: Scene, solids: Mapping[str, Solid], mesh: SimplexMesh) -> dict[
         elements = mesh.elements(body)
         found[name] = with_middles(tags, elements - elements.min()) if tags else tags
     return found
-
-
-def _shortest_edge(mesh: SimplexMesh) -> float:
-    """Return the length of the shortest edge of a mesh, m."""
-    corners = mesh.points[mesh.cells]
-    edges = corners[:, :, None] - corners[:, None]
-    a, b = np.triu_indices(mesh.cells.shape[1], 1)
-    return float(np.sqrt((edges[:, a, b] ** 2).sum(axis=-1).min()))
 
 
 def _evaluate(
