@@ -15,7 +15,7 @@ def option_story(prefix: str, error: PETSc.Error) -> str:
     """Return which option of a solver PETSc could not follow, and why."""
     text = petsc_text(error).rstrip(".")
     option = " or ".join(_options_meant(text, prefix)) or f"-{prefix}..."
-    hint = "; all of the matrix can be factorised with -fsi_mat_type aij" if "matrix type nest" in text else ""
+    hint = "; all of the matrix can be factorised with -fsi_mat_type aij" if "type nest" in text else ""
     return f"option {option}: PETSc cannot set this solver up: {text}{hint} (code {error.ierr})"
 
 
