@@ -274,6 +274,7 @@ def _prefixes() -> list[str]:
 
     rows = [
         (PREFIX, "the coupled system of a step: solid velocities and fluid pressures"),
+        (f"{PREFIX}snes_", "how often it is linearised: ..type ksponly | newtonls"),
         (field_prefix("solid"), "the solid's block in it, or a scene without fluid"),
         (field_prefix("pressure"), "the pressure's block in it, or a scene without solids"),
     ]

@@ -24,13 +24,13 @@ class Bench:
 
 #: Each name, with _ for -, is a module of this package whose ``run(case)`` returns a ``Report``.
 BENCHES = {
-    "column": Bench("a layer under water: frequency, damping and energy against theory", "3 min", "45 s"),
+    "column": Bench("a layer under water: frequency, damping and energy against theory", "4 min", "1 min"),
     "added-mass": Bench("added mass of a disk and a ball between the cells of a grid, against theory", "4 min", "45 s"),
     "interface": Bench("error against seconds: published and split schemes beside cut cells", "10 min", "1 min"),
     "splitting": Bench("growth per step of the split scheme, against linear theory", "30 s", "10 s"),
     "stability": Bench("which schemes, steps and dampings keep the bar in a jet bounded", "90 min", "4 min"),
     "phases": Bench("seconds per phase and step, monolithic against split, on the bar", "40 s", "10 s"),
-    "solids": Bench("solids and beams alone: error against seconds by element and integrator", "10 min", "40 s"),
+    "solids": Bench("solids and beams alone: error against seconds by element and integrator", "1 min", "25 s"),
     "solid-speed": Bench(
         "a solid's assembly against products with its matrix; its solve, eight times finer", "4 min", "5 s"
     ),
