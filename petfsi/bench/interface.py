@@ -119,8 +119,12 @@ def _attempt(trial: Trial, scheme: Scheme, cells: int, rate: int) -> Row:
 
 
 def timed(comm: MPI.Comm, scene: Scene, options: str, steps: int, column: str) -> tuple[np.ndarray, float]:
-    """Return a probe's value at the start and after each step, and the seconds of all steps. Collective."""
-    with simulation(comm, scene, options) as sim:
+    """Return a probe's value at the start and after each step, and the seconds of all steps. Collective.
+
+    No step is taken again in halves: a scheme that fails at a step has failed.
+    """
+    once = scene.model_copy(update={"time": scene.time.model_copy(update={"retries": 0})})
+    with simulation(comm, once, options) as sim:
         wanted = sim.probe_columns().index(column)
         values, seconds = [sim.probe()[wanted]], 0.0
         for _ in range(steps):
