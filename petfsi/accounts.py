@@ -22,8 +22,8 @@ class Accounts:
         Fluid in each region that was closed at the start, for the geometry at which the step was taken (cut cells:
         exact for the surface; ray: whole cells). nan once it was opened, divided or joined with another.
     ``momentum.x``, ...
-        Of the fluid, sum_f m_f v_f with m_f = rho B_f A_f dx over the faces that the pressure acts on (half of it at
-        open sides), and of the solids. Of ``midpoint``, v is what the step's kick left.
+        Of the fluid, sum_f m_f v_f with m_f = rho alpha_f A_f dx over the faces that the pressure acts on (half of it
+        at open sides), and of the solids. Of ``midpoint``, v is what the step's kick left.
     ``kinetic``
         sum_f m_f v_f^2 / 2 of the fluid, and the solids' u . M u / 2.
     ``elastic``

@@ -157,7 +157,7 @@ class Newton:
 
     def _floor(self, x: PETSc.Vec) -> float:
         """Return the norm of the function that is round-off at x. Collective."""
-        return sum(field.round_off(part) for field, part in zip(self.system.fields, self.system.values(x), strict=True))
+        return self.system.round_off(x)
 
     def _aim(self, snes: PETSc.SNES, _step: int) -> None:
         """Ask for no less than round-off, which grows with the way. Collective."""

@@ -313,23 +313,27 @@ class Solver:
         ksp = self._ksp
         assert ksp is not None
         self._inner_iterations = 0
-        if self._pressure is not None and ksp.getType() != PETSc.KSP.Type.PREONLY:
-            self._pressure.aim(ksp.getTolerances()[0] * b.norm())
+        floor = self.system.round_off()
+        if ksp.getType() != PETSc.KSP.Type.PREONLY:
+            if not PETSc.Options(self.prefix).hasName("ksp_atol"):
+                ksp.setTolerances(atol=floor)
+            if self._pressure is not None:
+                self._pressure.aim(max(ksp.getTolerances()[0] * b.norm(), floor))
         try:
             ksp.solve(b, x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{self.prefix}' broke down: {petsc_text(error)}") from None
         norms = self.system.update_residual(x, b)
-        self._judge(ksp, norms, slack)
+        self._judge(ksp, norms, slack, floor)
         return max(self._inner_iterations, ksp.getIterationNumber()), norms
 
-    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float) -> None:
+    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float, floor: float) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
         solvers = [ksp, *self._sub_solvers(ksp)]
         iterative = [s.getTolerances()[0] for s in solvers if s.getType() != PETSc.KSP.Type.PREONLY]
         outer = ksp.getType() != PETSc.KSP.Type.PREONLY
         rtol = iterative[0] if outer else max(iterative, default=1e-8)
-        wanted = slack * rtol * norms["rhs"]
+        wanted = slack * max(rtol * norms["rhs"], floor)
         failed = [s for s in solvers if s.getConvergedReason() < 0]
         finite = np.isfinite(norms[""])
         if self.fixed_iterations:

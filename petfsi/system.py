@@ -131,6 +131,10 @@ class System:
         norms["rhs"] = float(total[-1])
         return norms
 
+    def round_off(self, x: PETSc.Vec | None = None) -> float:
+        """Return what the norm of the residual at x (the solution if not given) cannot fall below. Collective."""
+        return sum(field.round_off(part) for field, part in zip(self.fields, self.values(x), strict=True))
+
     def values(self, of: PETSc.Vec | None = None) -> list[np.ndarray]:
         """Return the solution (or another vector) of each field on this rank, SI."""
         x = (self.solution if of is None else of).array_r

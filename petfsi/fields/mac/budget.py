@@ -1,7 +1,8 @@
 """What a fluid on a staggered grid holds, and what forces and sides do to it: momentum and energy by faces.
 
-A face that the pressure acts on has the mass m_f = rho B_f A_f dx; at an open side, where p = 0 lies half a cell away,
-it has half of that. With it a step's kick, v_w = v* - (c/rho) G p, does exactly the work of the pressure on all walls:
+A face that the pressure acts on has the mass m_f = rho alpha_f A_f dx; at an open side, where p = 0 lies half a cell
+away, it has half of that. With it a step's kick, v_w = v* - (c/rho) G p, does exactly the work of the pressure on all
+walls:
 
     sum_f m_f v_w (v_w - v*) / c = - sum_c p_c (outflow of c through walls) - sum_open p_f (outflow) .
 """

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
-    "cell_kind", "face_kind", "openness", "volume", "extras", "index", "layout", "block", "rhs",
+    "cell_kind", "face_kind", "openness", "narrow", "volume", "extras", "index", "layout", "block", "rhs",
 )  # fmt: skip
 
 
@@ -42,6 +42,8 @@ class CoveredGrid(FluidField):
         Face arrays, valid in all ghosts.
     openness : list of ndarray
         Face arrays: how much of a face lets fluid through, see ``cut``; 1 where nothing cuts cells.
+    narrow : list of ndarray of bool or None
+        Face arrays, see ``kinds.narrow_faces``; None where nothing cuts cells.
     index : ndarray of IntType
         Cell array of the unknowns' global numbers.
     extras : Extras or None
@@ -73,6 +75,7 @@ class CoveredGrid(FluidField):
         self.cell_kind = np.full(grid.shape(None), kinds.OUTSIDE, dtype=np.uint8)
         self.face_kind = [grid.zeros_faces(axis, np.uint8) for axis in self._axes]
         self.openness = [np.ones(grid.shape(axis)) for axis in self._axes]
+        self.narrow = None if self._cutter is None else [grid.zeros_faces(axis, bool) for axis in self._axes]
         self.index = grid.index
         self.extras: Extras | None = None
         self.volume: np.ndarray | None = None
@@ -148,10 +151,15 @@ class CoveredGrid(FluidField):
         )
         if found.extras is not None or self.extras is not None:
             changed = changed or found.extras is None or not found.extras.same(self.extras)
-        if self.comm.allreduce(changed, op=MPI.LOR):
+        wider = self.narrow is None or any(map(np.any, map(np.not_equal, found.narrow, self.narrow)))
+        changed, wider = self.comm.allreduce(np.array([changed, wider]), op=MPI.LOR)
+        self.narrow = found.narrow
+        if changed:
             self._renumber(found)
             self.cell_kind, self.face_kind = found.cell_kind, found.face_kind
             self._kinds_changed()
+        elif wider:
+            self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.geometry_version += 1
         return found.walls, found.wet
@@ -184,6 +192,7 @@ class CoveredGrid(FluidField):
         self.kinds_version += 1
         kind_x, kind_y, kind_z = three(self.face_kind)
         self._active = pressure.active_cells(self.cell_kind, kind_x, kind_y, kind_z, self.dim == 2)
+        self._reach_changed()
 
     def closed_regions(self, touched: np.ndarray | None) -> list[tuple[np.ndarray, bool]]:
         """Return the connected regions of fluid without an OPEN face, but for single cells. Collective.
@@ -219,6 +228,9 @@ class CoveredGrid(FluidField):
             np.subtract.at(whole.reshape(-1), self.extras.cell, self.extras.volume)
             volume = np.concatenate((self.grid.to_vec(whole), self.extras.volume))
         return self.cell_volume * volume
+
+    def _reach_changed(self) -> None:
+        """Refresh what follows from where the flow can be read. Collective."""
 
     def _assemble_block(self, factor: float) -> None:
         """Fill L for the step's factor (see ``transport``). Collective."""

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from numba import njit
 
 from petfsi.fields.mac import kinds
-from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, join, patch_slots
+from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, links_of, patch_slots, walls_of
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.sides import Surroundings
@@ -26,7 +26,9 @@ class Openings:
     cell_kind : ndarray of uint8
     face_kind : list of ndarray of uint8
     openness : list of ndarray
-        B_f of faces that are not SPLIT, see ``cut``.
+        Open fraction of faces that are not SPLIT, else 0.
+    narrow : list of ndarray of bool
+        Face arrays, see ``kinds.narrow_faces``.
     volume : ndarray
         Open part of each cell's volume.
     layout : Layout
@@ -44,6 +46,7 @@ class Openings:
     cell_kind: np.ndarray
     face_kind: list[np.ndarray]
     openness: list[np.ndarray]
+    narrow: list[np.ndarray]
     volume: np.ndarray
     layout: Layout
     index: np.ndarray
@@ -112,8 +115,9 @@ class CutGrid:
         grid = self.grid
         every = np.concatenate((points, self.points)), np.concatenate((facets, self.facets + len(points)))
         found = cut(*every, self.lattice, self.base)
-        links, walls = join(found, self.shape, grid.dx, self._sides, len(facets))
-        links = self._without_walls(links)
+        links = self._without_walls(links_of(found, self.shape))
+        slot = patch_slots(found, len(self._flat))
+        walls = walls_of(found, slot, len(facets))
         openness, split = self._openness(found, links)
         volume = grid.zeros_cells()
         self._part(volume, None)[...] = found.volume
@@ -124,9 +128,10 @@ class CutGrid:
         solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
         walls = Walls(walls.facet[used], walls.axis[used], numbers[walls.slot[used]], walls.flux[used])
-        patches = np.flatnonzero(solved[patch_slots(found, len(self._flat))] & (found.facet < len(facets)))
+        patches = np.flatnonzero(solved[slot] & (found.facet < len(facets)))
         wet = first_moments(found, patches, self._centres(found.cell[patches]))
-        return Openings(cell_kind, face_kind, openness, volume, layout, index, extras, walls, wet)
+        narrow = self._narrow(openness, face_kind)
+        return Openings(cell_kind, face_kind, openness, narrow, volume, layout, index, extras, walls, wet)
 
     def _openness(self, found: CutCells, links: Links) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return the openness of local faces by axis, zero where split, and which are split (flat). Collective."""
@@ -134,10 +139,8 @@ class CutGrid:
         for a in range(self.grid.dim):
             whole = self.grid.zeros_faces(a)
             self._part(whole, a)[...] = found.open[a]
-            flat, plain = whole.reshape(-1), (links.axis == a) & ~links.split
-            flat[self._flat_faces[a][links.face[plain]]] = links.openness[plain]
             torn = np.unique(self._flat_faces[a][links.face[(links.axis == a) & links.split]])
-            flat[torn] = 0.0
+            whole.reshape(-1)[torn] = 0.0
             self.grid.exchange_faces(a, whole)
             openness.append(whole)
             split.append(torn)
@@ -172,6 +175,17 @@ class CutGrid:
         grid.exchange_cells(cell_kind)
         cell_kind[(cell_kind == kinds.SOLID) & self._covered] = kinds.OBSTACLE
         return cell_kind, face_kind
+
+    def _narrow(self, openness: list[np.ndarray], face_kind: list[np.ndarray]) -> list[np.ndarray]:
+        """Return which faces of each axis are narrow. Collective."""
+        found = []
+        for a in range(self.grid.dim):
+            narrow = self.grid.zeros_faces(a, bool)
+            across = tuple(step for b, step in enumerate(kinds.STEP[: self.grid.dim]) if b != a)
+            kinds.narrow_faces(openness[a], face_kind[a], across, narrow)
+            self.grid.exchange_faces(a, narrow)
+            found.append(narrow)
+        return found
 
     def _number(self, found: CutCells, links: Links) -> tuple[Layout, np.ndarray, Extras | None, np.ndarray]:
         """Return layout, cell numbers, extras, and the global number of each slot. Collective."""

@@ -10,8 +10,8 @@ from petfsi.fields.mac.grid import MacGrid
 
 #: Layers of a band: more than the ghost width, so that whatever a departure point meets is filled.
 LAYERS = 6
-#: Layers between two exchanges; ghosts are worked on redundantly, each layer spoiling one from outside.
-BATCH = 3
+#: Layers between two exchanges; ghosts are worked on redundantly, each layer spoiling two from outside.
+BATCH = 2
 #: The layer of entries that no layer reaches, and of those outside the domain.
 FAR = 255
 
@@ -63,11 +63,29 @@ def _average(q, layer, entries, strides):
         q[entry] = total / count
 
 
+@njit(cache=True)
+def _extrapolate(q, layer, entries, strides):
+    """Set entries of one layer to the mean of what lines through their neighbours in lower ones say.
+
+    A line needs a second entry behind the neighbour that is known no later than it; else the neighbour's value goes on.
+    """
+    for entry in entries:
+        total, count = 0.0, 0
+        for stride in strides:
+            for s in (-stride, stride):
+                if layer[entry + s] < layer[entry]:
+                    straight = layer[entry + 2 * s] <= layer[entry + s]
+                    total += 2.0 * q[entry + s] - q[entry + 2 * s] if straight else q[entry + s]
+                    count += 1
+        q[entry] = total / count
+
+
 class Band:
     """The layers of undetermined faces of an axis (or cells: None) next to determined ones.
 
-    An entry's layer is its distance from the known entries, in steps along the grid; it takes the mean of its
-    neighbours in lower layers, so the result does not depend on the ranks.
+    An entry's layer is its distance from the known entries, in steps along the grid. Velocities are extrapolated
+    linearly from lower layers; values of cells, which must stay within bounds, take the mean of their neighbours there.
+    Neither depends on the ranks.
 
     Attributes
     ----------
@@ -84,9 +102,9 @@ class Band:
         self.layer = np.full(shape, FAR, dtype=np.uint8)
         self._strides = tuple((shape[1] * shape[2], shape[2], 1)[: grid.dim])
         self._lists: list[np.ndarray] = []
-        # entries at the very end of the array have no neighbours there; the exchange fills them
+        # entries at the very end of the array lack neighbours there; the exchange fills them
         self._part = tuple(
-            (max(s.start, 1), min(s.stop, n - 1)) if b < grid.dim else (0, 1)
+            (max(s.start, 2), min(s.stop, n - 2)) if b < grid.dim else (0, 1)
             for b, (s, n) in enumerate(zip(grid.inside(axis), shape, strict=True))
         )
 
@@ -113,7 +131,8 @@ class Band:
         if self.empty:
             return
         flat = q.reshape(-1)
+        spread = _average if self.axis is None else _extrapolate
         for first in range(0, LAYERS, BATCH):
             for entries in self._lists[first : first + BATCH]:
-                _average(flat, self.layer.reshape(-1), entries, self._strides)
+                spread(flat, self.layer.reshape(-1), entries, self._strides)
             self.grid.halo.exchange(q, self.axis)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_matrix, csr_matrix
 
 from petfsi.fields.mac.grid import MacGrid
-from petfsi.fields.mac.pressure import POCKET_DIAGONAL, Pattern
+from petfsi.fields.mac.pressure import LEAST_OPEN, POCKET_DIAGONAL, Pattern
 from petfsi.petsc import IntType, Layout
 
 
@@ -32,7 +32,7 @@ class Extras:
     mine_below, mine_above : ndarray of bool, shape (n_links,)
         Whether that unknown is this rank's, and not just its image in a ghost.
     openness : ndarray, shape (n_links,)
-        That of the part, see ``cut``.
+        That of the part: a fraction of the face.
     """
 
     cell: np.ndarray
@@ -89,7 +89,7 @@ class Extras:
         indptr = np.concatenate((pattern.indptr, np.full(n_rows - n_cells, pattern.indptr[-1])))
         shape = (n_rows, layout.n_global)
         rows = csr_matrix((values, columns, indptr), shape=shape)
-        weight = c[self.axis] * self.openness
+        weight = c[self.axis] * np.maximum(self.openness, LEAST_OPEN)
         gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
         i, j, v = [], [], []
         ends = ((self.below, self.above, self.mine_below), (self.above, self.below, self.mine_above))

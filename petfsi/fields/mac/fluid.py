@@ -85,7 +85,8 @@ class MacFluid(CoveredGrid):
         if fluid.smoke is not None and self.smoke is not None:
             self._evaluate(fluid.smoke.initial, "fluid.smoke.initial", self.smoke, None)
             self.smoke[self.cell_kind != kinds.FLUID] = 0.0
-        self._complete()
+            self._complete_cells(self.smoke)
+        self._transport.carried = self._extend(self.velocity)
 
     def _evaluate(self, text: Number, key: str, array: np.ndarray, axis: int | None) -> None:
         """Fill the owned part of a local array with the values of an expression at time zero. Collective."""
@@ -104,17 +105,21 @@ class MacFluid(CoveredGrid):
         self._extra_pressure = np.zeros(0) if found.extras is None else known.reshape(-1)[found.extras.cell]
 
     def _kinds_changed(self) -> None:
-        """Refresh bands and prescribed velocities, too. Collective."""
+        """Refresh the smoke's band and prescribed velocities, too. Collective."""
         super()._kinds_changed()
+        if self._smoke_band is not None:
+            self._smoke_band.rebuild(self.cell_kind == kinds.FLUID)
+        self.surroundings.prescribe(self.face_kind, self.boundary_velocity)
+
+    def _reach_changed(self) -> None:
+        """Refresh the velocity's bands. Collective."""
         for axis in self._axes:
-            self._bands[axis].rebuild(self.face_kind[axis] != kinds.DEAD)
+            known = self.face_kind[axis] != kinds.DEAD
+            self._bands[axis].rebuild(known if self.narrow is None else known & ~self.narrow[axis])
         self._moved = [
             (band.layer != FAR) & (kind != kinds.WALL) & (kind != kinds.SOLID_FACE)
             for band, kind in zip(self._bands, self.face_kind, strict=True)
         ]
-        if self._smoke_band is not None:
-            self._smoke_band.rebuild(self.cell_kind == kinds.FLUID)
-        self.surroundings.prescribe(self.face_kind, self.boundary_velocity)
 
     def unknown(self) -> np.ndarray:
         """Return the pressure of this rank's cells and of its extra unknowns, Pa, in PETSc's order.
@@ -132,11 +137,11 @@ class MacFluid(CoveredGrid):
         """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
         self._remember("smoke", "_extra_pressure")
         transport = self._transport
-        transport.predict(self.velocity, self._moved, dt, self.velocity_star)
+        transport.predict(self._moved, dt, self.velocity_star)
         moment, smoke = transport.moment(dt), self.smoke
         if self.smoke is not None and self._smoke_band is not None:
             old = self.smoke
-            self.smoke = transport.carry_smoke(old, self.velocity, self._smoke_band.layer != FAR, dt)
+            self.smoke = transport.carry_smoke(old, self._smoke_band.layer != FAR, dt)
             self._complete_cells(self.smoke)
             smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
         self.surroundings.evaluate(time + moment)
@@ -196,6 +201,13 @@ class MacFluid(CoveredGrid):
         if self.extras is not None:
             self.extras.add_inflow(self.velocity_star, areas, self.layout, self.rhs)
 
+    def round_off(self, x: np.ndarray) -> float:
+        """Return eps (||L|| ||p|| + ||A v*||): net outflows are differences of what goes in and out. Collective."""
+        stars = [star[self.grid.owned(axis)] for axis, star in enumerate(self.velocity_star)]
+        squares = sum(self.grid.face_area(axis) ** 2 * float(np.vdot(v, v)) for axis, v in enumerate(stars))
+        flow = float(np.sqrt(self.comm.allreduce(squares)))
+        return super().round_off(x) + float(np.finfo(float).eps) * self.row_scale * flow
+
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the pressure and set the velocity that goes with it. Collective.
 
@@ -230,8 +242,7 @@ class MacFluid(CoveredGrid):
                 self._extra_pressure += rest.reshape(-1)[self.extras.cell]
         if self.extras is not None or self._other_pressure is not None:
             self._remember_extras()
-        self._complete_faces(solved)
-        self.velocity = self._transport.accept(self.velocity, solved, self.face_kind, dt, self._complete_faces)
+        self.velocity = self._transport.accept(solved, self.face_kind, dt, self._extend)
         if self.smoke is not None:
             self._complete_cells(self.smoke)
 
@@ -242,17 +253,22 @@ class MacFluid(CoveredGrid):
             second = self.extras.piece == 1
             self._other_pressure.reshape(-1)[self.extras.cell[second]] = self._extra_pressure[second]
 
-    def _complete(self) -> None:
-        """Fill ghosts, bands and what lies beyond the sides. Collective."""
-        self._complete_faces(self.velocity)
-        if self.smoke is not None:
-            self._complete_cells(self.smoke)
+    def _extend(self, faces: list[np.ndarray]) -> list[np.ndarray]:
+        """Fill ghosts, bands and what lies beyond the sides; return copies that narrow faces are not read from.
 
-    def _complete_faces(self, faces: list[np.ndarray]) -> None:
-        for axis in self._axes:
-            self.grid.exchange_faces(axis, faces[axis])
-            self._bands[axis].fill(faces[axis])
-            self.grid.fill_sides(faces[axis], axis)
+        Without any such faces the arrays themselves are returned. Collective.
+        """
+        extended = []
+        for axis, v in enumerate(faces):
+            self.grid.exchange_faces(axis, v)
+            known = v if self.narrow is None else v.copy()
+            self._bands[axis].fill(known)
+            if self.narrow is not None:
+                np.copyto(v, known, where=~self.narrow[axis])
+                self.grid.fill_sides(v, axis)
+            self.grid.fill_sides(known, axis)
+            extended.append(known)
+        return extended
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
         assert self._smoke_band is not None
@@ -270,7 +286,7 @@ class MacFluid(CoveredGrid):
     def stock(self) -> Stock:
         """Return this rank's share of momentum and kinetic energy of the faces that the pressure acts on.
 
-        A face has the mass rho B_f A_f dx, one at an open side half of it. The velocity is that after the step's
+        A face has the mass rho alpha_f A_f dx, one at an open side half of it. The velocity is that after the step's
         kick, see ``transport``.
         """
         velocity = self._transport.kicked(self.velocity)
@@ -326,21 +342,36 @@ class MacFluid(CoveredGrid):
 
     def state(self) -> dict[str, Slab]:
         """Return velocity, kinds, pressure, smoke and the transport's past: all that the next step reads."""
-        arrays = {name: self.grid.slab(array, axis) for name, array, axis in [*self._stored(), *self._stored_past()]}
+        stored = [*self._stored(), *self._stored_reach(), *self._stored_past()]
+        arrays = {name: self.grid.slab(array, axis) for name, array, axis in stored}
         return arrays | ({"past_dt": scalar_slab(self.comm, self._transport.past_dt)} if self._transport.past else {})
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
-        for name, array, axis in [*self._stored(), *self._stored_past()]:
+        transport = self._transport
+        transport.carried = self.velocity if self.narrow is None else [v.copy() for v in self.velocity]
+        for name, array, axis in [*self._stored(), *self._stored_reach(), *self._stored_past()]:
             self.grid.read_slab(read, name, array, axis)
             self.grid.halo.exchange(array, axis)
-        for _, array, axis in self._stored_past():
-            self.grid.fill_sides(array, axis)
-        if self._transport.past:
-            self._transport.past_dt = float(read("past_dt", (0,), (1,))[0])
+        if transport.past:
+            transport.past_dt = float(read("past_dt", (0,), (1,))[0])
+        for arrays in (self.velocity, transport.carried, *transport.past.values()):
+            for axis in self._axes:
+                self.grid.fill_sides(arrays[axis], axis)
         self.geometry_version += 1
         self._kinds_changed()
-        self._complete()
+        if self.smoke is not None:
+            self._complete_cells(self.smoke)
+
+    def _stored_reach(self) -> list[tuple[str, np.ndarray, int | None]]:
+        """Return what the transport reads in place of the velocity, and the faces where the two differ."""
+        if self.narrow is None:
+            return []
+        stored: list[tuple[str, np.ndarray, int | None]] = []
+        for axis, letter in zip(self._axes, "xyz", strict=False):
+            stored.append((f"velocity_carried_{letter}", self._transport.carried[axis], axis))
+            stored.append((f"face_narrow_{letter}", self.narrow[axis], axis))
+        return stored
 
     def _stored_past(self) -> list[tuple[str, np.ndarray, int | None]]:
         past = self._transport.past

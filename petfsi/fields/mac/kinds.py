@@ -24,6 +24,40 @@ SPLIT = 5  # of a cell with several pieces of fluid: its parts join unknowns as 
 STEP = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
+#: Faces less open than this are not what a flow is read from, see ``narrow_faces``.
+NARROW = 0.25
+
+
+@njit(cache=True)
+def narrow_faces(openness, face_kind, across, narrow):
+    """Mark faces of an axis whose velocity is better extrapolated from their neighbours than read.
+
+    A sliver of fluid between a wall and a face's edge has next to no mass: what the pressure makes of its velocity is
+    right for the flux through it, but says little about the flow. Such a face has a wider one beside it. Faces of a
+    film between two walls have none, and say all that is known.
+
+    Parameters
+    ----------
+    openness, face_kind : ndarray
+        Face arrays.
+    across : tuple of (int, int, int)
+        The unit steps along the other axes.
+    narrow : ndarray of bool
+        The result; the outermost planes of the array are left alone.
+    """
+    n0, n1, n2 = openness.shape
+    flat = n2 == 1
+    for i in range(1, n0 - 1):
+        for j in range(1, n1 - 1):
+            for k in range(0 if flat else 1, 1 if flat else n2 - 1):
+                narrow[i, j, k] = False
+                if face_kind[i, j, k] != PRESSURE or openness[i, j, k] >= NARROW:
+                    continue
+                for di, dj, dk in across:
+                    widest = max(openness[i - di, j - dj, k - dk], openness[i + di, j + dj, k + dk])
+                    narrow[i, j, k] = narrow[i, j, k] or widest >= NARROW
+
+
 @njit(cache=True)
 def classify_faces(cell_kind, side_kind, crossed, step, face_kind):
     """Write the kind of every local face whose two cells are local, too.

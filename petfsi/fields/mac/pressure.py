@@ -20,6 +20,10 @@ INACTIVE_DIAGONAL = 0.05
 #: surface sees the cell; this much compressibility then keeps the system regular.
 POCKET_DIAGONAL = 1e-6
 
+#: The pressure sees a face that is open at all as open as this at least: between openings below it, round-off would
+#: become a flow. Only what the pressure drives goes through it, so that a flow which needs no pressure needs none.
+LEAST_OPEN = 1e-4
+
 
 class Pattern:
     """The 5- or 7-point pattern, the same for the whole run.
@@ -77,6 +81,12 @@ def _acts(kind):
 
 
 @njit(cache=True)
+def _seen(openness):
+    """Return how open the pressure sees a face."""
+    return max(openness, LEAST_OPEN) if openness > 0.0 else 0.0
+
+
+@njit(cache=True)
 def _conductance(kind, c):
     """Return what a face adds to the diagonal; c is dt/rho * area / dx."""
     if kind == PRESSURE:
@@ -122,10 +132,11 @@ def laplacian(active, kind0, kind1, kind2, open0, open1, open2, part, slot, c, v
                 kinds_below[1], kinds_above[1] = kind1[i, j, k], kind1[i, j + 1, k]
                 if not flat:
                     kinds_below[2], kinds_above[2] = kind2[i, j, k], kind2[i, j, k + 1]
-                below[0], above[0] = c[0] * open0[i, j, k], c[0] * open0[i + 1, j, k]
+                below[0] = c[0] * _seen(open0[i, j, k])
+                above[0] = c[0] * _seen(open0[i + 1, j, k])
                 below[1], above[1] = c[1] * open1[i, j, k], c[1] * open1[i, j + 1, k]
                 if not flat:
-                    below[2], above[2] = c[2] * open2[i, j, k], c[2] * open2[i, j, k + 1]
+                    below[2], above[2] = c[2] * _seen(open2[i, j, k]), c[2] * _seen(open2[i, j, k + 1])
                 diagonal = 0.0
                 for a in range(len(c)):
                     diagonal += _conductance(kinds_below[a], below[a]) + _conductance(kinds_above[a], above[a])

@@ -28,6 +28,8 @@ MAX_CROSSINGS = 10
 
 #: An array of faces per axis.
 Faces = list[np.ndarray]
+#: Fills ghosts, and faces without a velocity of their own; returns what is to be read of the arrays. Collective.
+Extend = Callable[[Faces], Faces]
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,11 @@ class Transport:
 
     Attributes
     ----------
+    carried : list of ndarray
+        The velocity at the step's begin as it is read here, ghosts valid: extrapolated, where it cannot be known well,
+        from where it can.
     past : dict of str to list of ndarray
-        Face arrays, ghosts valid, that the next step reads besides the velocity; not read while ``past_dt`` is zero.
+        Face arrays alike that the next step reads besides; not read while ``past_dt`` is zero.
     past_dt : float
         Length of the last step, s; zero before the first.
     """
@@ -139,6 +144,7 @@ class Transport:
         self.integrator: Newmark | Bdf2 | Midpoint = Newmark()
         self.advection = advection
         self.grid = advection.grid
+        self.carried: Faces = []
         self.past: dict[str, Faces] = {
             name: [self.grid.zeros_faces(axis) for axis in range(self.grid.dim)] for name in self.names
         }
@@ -154,49 +160,44 @@ class Transport:
         return self.integrator.moment(dt)
 
     def solved(self, velocity: Faces) -> Faces:
-        """Return v_w of the last step, which has no divergence, given the velocity at its end."""
+        """Return v_w of the step last accepted, which has no divergence, given the velocity at its end."""
         return velocity
 
     def kicked(self, velocity: Faces) -> Faces:
-        """Return what the last step's forces left, whose energy they changed, given the velocity at its end."""
+        """Return what that step's forces left, whose energy they changed, given the velocity at its end."""
         return velocity
 
-    def half_way(self, velocity: Faces, dt: float) -> Faces:
-        """Return the flow that carries from the step's begin to its end, given that at its begin."""
-        return velocity
+    def half_way(self, dt: float) -> Faces:
+        """Return the flow that carries from the step's begin to its end."""
+        return self.carried
 
-    def predict(self, velocity: Faces, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+    def predict(self, moved: list[np.ndarray], dt: float, star: Faces) -> None:
         """Write what is carried to the owned faces into ``star``. Collective."""
-        self._whole = self.advection.path(self.half_way(velocity, dt), dt)
-        for axis, v in enumerate(velocity):
+        self._whole = self.advection.path(self.half_way(dt), dt)
+        for axis, v in enumerate(self.carried):
             self.advection.carry(v, self._whole, moved[axis], axis, star[axis])
 
-    def carry_smoke(self, smoke: np.ndarray, velocity: Faces, moved: np.ndarray, dt: float) -> np.ndarray:
+    def carry_smoke(self, smoke: np.ndarray, moved: np.ndarray, dt: float) -> np.ndarray:
         """Return the smoke at the end of the step that was predicted, in the owned cells. Collective."""
         out = np.empty_like(smoke)
-        path = self._whole or self.advection.path(self.half_way(velocity, dt), dt)
+        path = self._whole or self.advection.path(self.half_way(dt), dt)
         self.advection.carry(smoke, path, moved, None, out)
         return out
 
-    def accept(
-        self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
-    ) -> Faces:
+    def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
         """Return the velocity at the step's end, and remember what the next one reads. Collective.
 
         Parameters
         ----------
-        velocity : list of ndarray
-            At the step's begin.
         solved : list of ndarray
-            v_w, complete.
+            v_w on owned faces; ghosts, and faces without a velocity of their own, are filled.
         kind : list of ndarray of uint8
             Of the faces.
         dt : float
             s.
-        complete : callable
-            Fills ghosts and bands of face arrays.
+        extend : callable
         """
-        self.past_dt = dt
+        self.carried, self.past_dt = extend(solved), dt
         return solved
 
 
@@ -218,36 +219,34 @@ class Bdf2Transport(Transport):
         super().__init__(advection)
         self.scheme = self.integrator = Bdf2()
 
-    def half_way(self, velocity: Faces, dt: float) -> Faces:
+    def half_way(self, dt: float) -> Faces:
         """Return the velocity at t^n + dt/2."""
-        return self._at(velocity, dt / 2)
+        return self._at(dt / 2)
 
-    def _at(self, velocity: Faces, later: float) -> Faces:
+    def _at(self, later: float) -> Faces:
         """Return the velocity a time after t^n, on the line through v^{n-1} and v^n."""
         if self.past_dt == 0.0 or later == 0.0:
-            return velocity
+            return self.carried
         s = later / self.past_dt
-        return [v + s * (v - before) for v, before in zip(velocity, self.past["velocity_before"], strict=True)]
+        return [v + s * (v - before) for v, before in zip(self.carried, self.past["velocity_before"], strict=True)]
 
-    def predict(self, velocity: Faces, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+    def predict(self, moved: list[np.ndarray], dt: float, star: Faces) -> None:
         """Write b v^n(x_d) - b' v^{n-1}(x_dd) into the owned part of ``star``. Collective."""
-        super().predict(velocity, moved, dt, star)
+        super().predict(moved, dt, star)
         if self.past_dt == 0.0:
             return
         b, b_past = self.scheme.weights(dt, self.past_dt)
-        far = self.advection.path(self._at(velocity, (dt - self.past_dt) / 2), dt + self.past_dt)
+        far = self.advection.path(self._at((dt - self.past_dt) / 2), dt + self.past_dt)
         for axis, before in enumerate(self.past["velocity_before"]):
             carried = np.empty_like(before)
             self.advection.carry(before, far, moved[axis], axis, carried)
             own = self.grid.owned(axis)
             star[axis][own] = b * star[axis][own] - b_past * carried[own]
 
-    def accept(
-        self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
-    ) -> Faces:
+    def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
         """Return v_w; the old velocity becomes the one before."""
-        self.past["velocity_before"], self.past_dt = velocity, dt
-        return solved
+        self.past["velocity_before"] = self.carried
+        return super().accept(solved, kind, dt, extend)
 
 
 class MidpointTransport(Transport):
@@ -271,49 +270,47 @@ class MidpointTransport(Transport):
     def __init__(self, advection: Advection) -> None:
         super().__init__(advection)
         self.scheme = self.integrator = Midpoint()
-        self._carried: Faces = []
+        self._start: Faces = []
+        self._last: tuple[Faces, Faces] | None = None
 
     def solved(self, velocity: Faces) -> Faces:
-        """Return the velocity in the middle of the last step."""
-        return self.past["velocity_middle"] if self.past_dt else velocity
+        """Return the velocity in the middle of the step last accepted."""
+        return velocity if self._last is None else self._last[0]
 
     def kicked(self, velocity: Faces) -> Faces:
-        """Return v'' of the last step."""
-        return self.past["velocity_kicked"] if self.past_dt else velocity
+        """Return v'' of the step last accepted."""
+        return velocity if self._last is None else self._last[1]
 
-    def half_way(self, velocity: Faces, dt: float) -> Faces:
+    def half_way(self, dt: float) -> Faces:
         """Return the velocity in the middle of the coming step."""
-        return self._at(velocity, dt / 2)
+        return self._at(dt / 2)
 
-    def _at(self, velocity: Faces, later: float) -> Faces:
+    def _at(self, later: float) -> Faces:
         """Return the velocity a time after t^n, on the line through that and the middle of the last step."""
-        pairs = zip(velocity, self.past["velocity_middle"], strict=True)
+        pairs = zip(self.carried, self.past["velocity_middle"], strict=True)
         return [self.scheme.later(v, w, later, self.past_dt) for v, w in pairs]
 
-    def predict(self, velocity: Faces, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+    def predict(self, moved: list[np.ndarray], dt: float, star: Faces) -> None:
         """Write v' into the owned part of ``star``, and keep it for the kick. Collective."""
         between = (self.past_dt + dt) / 2
-        path = self.advection.path(self._at(velocity, (dt - self.past_dt) / 4), between)
-        for axis, v in enumerate(self.kicked(velocity)):
+        path = self.advection.path(self._at((dt - self.past_dt) / 4), between)
+        for axis, v in enumerate(self.past["velocity_kicked"] if self.past_dt else self.carried):
             self.advection.carry(v, path, moved[axis], axis, star[axis])
-        self._carried = [v.copy() for v in star]
+        self._start = [v.copy() for v in star]
 
-    def accept(
-        self, velocity: Faces, solved: Faces, kind: list[np.ndarray], dt: float, complete: Callable[[Faces], None]
-    ) -> Faces:
+    def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
         """Return the velocity at the step's end. Collective."""
-        middle = self.past["velocity_middle"] if self.past_dt else velocity
-        pairs = zip(solved, middle, strict=True)
-        ahead = [self.scheme.ahead(w, before, dt, self.past_dt) for w, before in pairs]
-        complete(ahead)
+        before = self.past["velocity_middle"] if self.past_dt else self.carried
+        middle = extend(solved)
+        ahead = [self.scheme.ahead(w, b, dt, self.past_dt) for w, b in zip(solved, before, strict=True)]
+        self.carried = extend(ahead)
         given = [(k == kinds.WALL) | (k == kinds.SOLID_FACE) for k in kind]
         kicked = [
             np.where(where, end, 2 * w - start)
-            for where, end, w, start in zip(given, ahead, solved, self._carried, strict=True)
+            for where, end, w, start in zip(given, ahead, solved, self._start, strict=True)
         ]
-        complete(kicked)
-        self.past = {"velocity_middle": solved, "velocity_kicked": kicked}
-        self.past_dt, self._carried = dt, []
+        self.past = {"velocity_middle": middle, "velocity_kicked": extend(kicked)}
+        self.past_dt, self._start, self._last = dt, [], (solved, kicked)
         return ahead
 
 
