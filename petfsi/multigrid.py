@@ -238,19 +238,31 @@ class Multigrid:
         for n, transfer in enumerate(self.transfers):
             pc.setMGInterpolation(levels - 1 - n, transfer.linear)
 
-    def refresh(self, fluxes: PETSc.Mat, walls: PETSc.Mat | None, pattern_version: int) -> None:
-        """Make the coarse operators of L and E, in place if the pattern of L is that of the last call. Collective."""
+    def refresh(self, block: PETSc.Mat, fluxes: PETSc.Mat, walls: PETSc.Mat | None, pattern_version: int) -> None:
+        """Make the coarse operators, in place if the pattern of L is that of the last call. Collective.
+
+        Parameters
+        ----------
+        block : PETSc.Mat
+            L and what slivers of fluid at walls add to it, which coarse grids do not see.
+        fluxes : PETSc.Mat
+            L; may be the same.
+        walls : PETSc.Mat or None
+            E.
+        pattern_version : int
+            Of L's pattern.
+        """
         if pattern_version != self._pattern_version:
             self._fluxes, self._pattern_version = [], pattern_version
         if self._galerkin:
             for level in range(1, len(self.transfers) + 1):  # of the coarse ones nobody knows the parts
-                self._tell(level, (fluxes, walls) if level == len(self.transfers) else (None, None))
+                self._tell(level, (block, walls) if level == len(self.transfers) else (None, None))
             self._read = True
             return
         first = not self._fluxes
         levels = len(self.transfers) + 1
-        finest = fluxes if walls is None else self._fine
-        operators, parts = [], [(fluxes, walls)]
+        finest = block if walls is None else self._fine
+        operators, parts = [], [(block, walls)]
         for n, transfer in enumerate(self.transfers):
             carry = transfer.constant if transfer.regular else transfer.linear
             fluxes = _carried(fluxes, carry, None if first else self._fluxes[n])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
+from numba import njit
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
@@ -49,8 +50,15 @@ def new_block(comm: MPI.Comm, rows: Layout, cols: Layout, block_size: int = 1) -
     mat.setType(PETSc.Mat.Type.AIJ)
     if block_size > 1:
         mat.setBlockSize(block_size)
+    else:
+        forget_inodes(mat)
     mat.setUp()
     return mat
+
+
+def forget_inodes(mat: PETSc.Mat) -> None:
+    """Multiply row by row from now on: whether PETSc groups equal rows, and so rounds, depends on former patterns."""
+    mat.setOption(PETSc.Mat.Option.USE_INODES, False)
 
 
 def set_csr(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray, new_pattern: bool) -> None:
@@ -157,6 +165,47 @@ def gather_triplets(
     indptr = np.zeros(rows.n_local + 1, dtype=IntType)
     np.cumsum(np.bincount(local, minlength=rows.n_local), out=indptr[1:])
     return indptr, j.astype(IntType), values
+
+
+def sum_csr(
+    ptr_a: np.ndarray, col_a: np.ndarray, val_a: np.ndarray, ptr_b: np.ndarray, col_b: np.ndarray, val_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sum of two matrices in compressed rows with sorted columns, by row."""
+    most = len(col_a) + len(col_b)
+    indptr, indices = np.zeros(len(ptr_a), dtype=IntType), np.empty(most, dtype=IntType)
+    values = np.empty(most)
+    n = _merge(ptr_a, col_a, val_a, ptr_b, col_b, val_b, indptr, indices, values)
+    return indptr, indices[:n], values[:n]
+
+
+@njit(cache=True)
+def _merge(ptr_a, col_a, val_a, ptr_b, col_b, val_b, indptr, indices, values):
+    n = 0
+    for row in range(len(ptr_a) - 1):
+        a, b = ptr_a[row], ptr_b[row]
+        while a < ptr_a[row + 1] or b < ptr_b[row + 1]:
+            from_a = a < ptr_a[row + 1] and (b == ptr_b[row + 1] or col_a[a] <= col_b[b])
+            from_b = b < ptr_b[row + 1] and (a == ptr_a[row + 1] or col_b[b] <= col_a[a])
+            indices[n] = col_a[a] if from_a else col_b[b]
+            values[n] = 0.0
+            if from_a:
+                values[n] += val_a[a]
+                a += 1
+            if from_b:
+                values[n] += val_b[b]
+                b += 1
+            n += 1
+        indptr[row + 1] = n
+    return n
+
+
+def row_sums(indptr: np.ndarray, _columns: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sum of each row of a matrix in compressed rows."""
+    sums = np.zeros(len(indptr) - 1)
+    full = np.diff(indptr) > 0
+    if len(values):
+        sums[full] = np.add.reduceat(values, indptr[:-1][full])
+    return sums
 
 
 # ---- options ------------------------------------------------------------------------------------------------

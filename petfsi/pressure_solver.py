@@ -135,7 +135,7 @@ class PressureSolver:
         versions = [field.pattern_version for field in self.system.fields]
         versions += [coupling.pattern_version for coupling in self.system.couplings]
         self._first_iterations = self._first_iterations or iterations
-        now = np.concatenate([field.block.getDiagonal().array_r for field in self.system.fields])
+        now = np.concatenate([field.matrices[-1].getDiagonal().array_r for field in self.system.fields])
         stale = versions != self._versions or iterations > self._growth * self._first_iterations
         if self._built is not None:
             stale = stale or bool(np.any(np.abs(now - self._built) > self._change * np.abs(self._built)))
@@ -147,7 +147,7 @@ class PressureSolver:
     def _pass_on(self, stale: bool = True) -> None:
         if stale and self._multigrid is not None:
             walls = self.stand_in.walls if self.stand_in is not None and self.stand_in.matter else None
-            self._multigrid.refresh(self.fluid.block, walls, self.fluid.pattern_version)
+            self._multigrid.refresh(self.fluid.block, self.fluid.fluxes, walls, self.fluid.pattern_version)
         if self.eliminates and self._ksp is not None:
             schur = self._ksp.getOperators()[0]
             schur.setNullSpace(self.fluid.block.getNullSpace())

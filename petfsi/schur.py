@@ -5,16 +5,18 @@ walls touch. X keeps what matters near the walls: a mass alone would be wrong fo
 light ones. The factor was found by trial: A^-1 is X / 3 for motions of single nodes, and far more for smooth ones.
 Where E is small beside L, as for most solids, it is left out and costs nothing. What X lacks are the
 large motions of light bodies; see ``modes``.
+
+Where a coupling has added J T J^T to A (see ``fields.mac.slivers``), pressures have T to push besides: E becomes
+E (I + T E)^-1, of which the diagonal of E is taken in the place of the second one.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
-from numba import njit
 from petsc4py import PETSc
 
-from petfsi.petsc import IntType, Layout, new_block, set_csr
+from petfsi.petsc import IntType, Layout, new_block, set_csr, sum_csr
 from petfsi.system import System
 
 #: X times the diagonal of A.
@@ -44,6 +46,7 @@ class SchurStandIn:
 
     def __init__(self, system: System, faint: float) -> None:
         solid, fluid = system.fields
+        self._system = system
         layout: Layout = fluid.layout
         self.solid_block, self.fluxes = solid.block, fluid.block
         self.force_block = system.operator.getNestSubMatrix(0, 1)
@@ -61,37 +64,57 @@ class SchurStandIn:
         self._fill_operator()
 
     def _fill_walls(self) -> None:
-        inverse = self.solid_block.getDiagonal()
-        inverse.reciprocal()
-        inverse.scale(SOFTER)
-        self.matter = self._strength(inverse) > self._faint
+        inverse, factors = self._yielding()
+        squares = self._squares(inverse)
+        relief = squares.duplicate()
+        relief.array = 1.0 / np.sqrt(1.0 + factors * squares.array_r)
+        self.matter = self._strength(squares.array_r * relief.array_r**2) > self._faint
         if self.matter:
-            yielding = self.force_block.copy()
+            felt = self.force_block.copy()
+            felt.diagonalScale(R=relief)
+            yielding = felt.copy()
             yielding.diagonalScale(L=inverse)
             # J^T X J, positive also where the transfer is not symmetric and D1 H is not J^T
-            walls = self.force_block.transposeMatMult(yielding)
+            walls = felt.transposeMatMult(yielding)
             rows = walls.getValuesCSR()
-            yielding.destroy()
-            walls.destroy()
+            for thing in (felt, yielding, walls):
+                thing.destroy()
         else:
             rows = np.zeros(self.walls.getLocalSize()[0] + 1, dtype=IntType), np.zeros(0, dtype=IntType), np.zeros(0)
         self._walls_pattern = self._set(self.walls, rows, self._walls_pattern)
-        inverse.destroy()
+        for vec in (inverse, squares, relief):
+            vec.destroy()
 
-    def _strength(self, inverse: PETSc.Vec) -> float:
-        """Return the largest E_ii / L_ii. Collective."""
+    def _yielding(self) -> tuple[PETSc.Vec, np.ndarray]:
+        """Return X, and T by this rank's unknowns in the solver's units."""
+        fluid = self._system.fields[1]
+        inverse, factors = self.solid_block.getDiagonal(), np.zeros(fluid.layout.n_local)
+        inverse.reciprocal()
+        inverse.scale(SOFTER)
+        for coupling in self._system.couplings:
+            if coupling.pushed is not None:
+                factors += coupling.pushed / (fluid.row_scale * fluid.col_scale)
+        return inverse, factors
+
+    def _squares(self, inverse: PETSc.Vec) -> PETSc.Vec:
+        """Return the diagonal of J^T X J. Collective."""
         squares = self.force_block.copy()
         indptr, indices, values = squares.getValuesCSR()
         set_csr(squares, indptr, indices, values**2, new_pattern=False)
-        diagonal, resistance = squares.createVecRight(), self.fluxes.getDiagonal()
+        diagonal = squares.createVecRight()
         squares.multTranspose(inverse, diagonal)
-        strongest = float((diagonal.array_r / resistance.array_r).max(initial=0.0))
-        for thing in (squares, diagonal, resistance):
-            thing.destroy()
+        squares.destroy()
+        return diagonal
+
+    def _strength(self, walls: np.ndarray) -> float:
+        """Return the largest E_ii / L_ii. Collective."""
+        resistance = self.fluxes.getDiagonal()
+        strongest = float((walls / resistance.array_r).max(initial=0.0))
+        resistance.destroy()
         return self._comm.allreduce(strongest, MPI.MAX)
 
     def _fill_operator(self) -> None:
-        rows = _sum(*self.fluxes.getValuesCSR(), *self.walls.getValuesCSR())
+        rows = sum_csr(*self.fluxes.getValuesCSR(), *self.walls.getValuesCSR())
         self._pattern = self._set(self.operator, rows, self._pattern)
 
     def _set(
@@ -104,35 +127,3 @@ class SchurStandIn:
         new = known is None or not (np.array_equal(indptr, known[0]) and np.array_equal(indices, known[1]))
         set_csr(mat, indptr, indices, values, new_pattern=self._comm.allreduce(new) > 0)
         return indptr, indices
-
-
-def _sum(
-    ptr_a: np.ndarray, col_a: np.ndarray, val_a: np.ndarray, ptr_b: np.ndarray, col_b: np.ndarray, val_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sum of two matrices in compressed rows with sorted columns."""
-    most = len(col_a) + len(col_b)
-    indptr, indices = np.zeros(len(ptr_a), dtype=IntType), np.empty(most, dtype=IntType)
-    values = np.empty(most)
-    n = _merge(ptr_a, col_a, val_a, ptr_b, col_b, val_b, indptr, indices, values)
-    return indptr, indices[:n], values[:n]
-
-
-@njit(cache=True)
-def _merge(ptr_a, col_a, val_a, ptr_b, col_b, val_b, indptr, indices, values):
-    n = 0
-    for row in range(len(ptr_a) - 1):
-        a, b = ptr_a[row], ptr_b[row]
-        while a < ptr_a[row + 1] or b < ptr_b[row + 1]:
-            from_a = a < ptr_a[row + 1] and (b == ptr_b[row + 1] or col_a[a] <= col_b[b])
-            from_b = b < ptr_b[row + 1] and (a == ptr_a[row + 1] or col_b[b] <= col_a[a])
-            indices[n] = col_a[a] if from_a else col_b[b]
-            values[n] = 0.0
-            if from_a:
-                values[n] += val_a[a]
-                a += 1
-            if from_b:
-                values[n] += val_b[b]
-                b += 1
-            n += 1
-        indptr[row + 1] = n
-    return n

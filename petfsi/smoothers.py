@@ -25,6 +25,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from petfsi.petsc import row_sums
+
 #: Largest E_ii / L_ii up to which the diagonal is good enough.
 DOMINANT = 10.0
 #: The lower root of Chebyshev's polynomial of degree 2 on [0.4, 2].
@@ -102,10 +104,7 @@ class Walls:
 def _bound(mat: PETSc.Mat) -> PETSc.Vec:
     """Return max(a_ii, sum_j |a_ij| / 2) by row. Collective."""
     diagonal = mat.getDiagonal()
-    indptr, _, values = mat.getValuesCSR()
-    sums = np.zeros(len(indptr) - 1)
-    full = np.diff(indptr) > 0
-    if len(values):
-        sums[full] = np.add.reduceat(np.abs(values), indptr[:-1][full])
+    indptr, columns, values = mat.getValuesCSR()
+    sums = row_sums(indptr, columns, np.abs(values))
     diagonal.array = np.maximum(diagonal.array_r, 0.5 * sums)
     return diagonal

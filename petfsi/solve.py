@@ -313,7 +313,7 @@ class Solver:
         ksp = self._ksp
         assert ksp is not None
         self._inner_iterations = 0
-        floor = self.system.round_off()
+        floor = self.system.rhs_round_off()
         if ksp.getType() != PETSc.KSP.Type.PREONLY:
             if not PETSc.Options(self.prefix).hasName("ksp_atol"):
                 ksp.setTolerances(atol=floor)

@@ -95,7 +95,8 @@ class System:
         scales = {field.name: (field.row_scale, field.col_scale) for field in self.fields}
         for field in self.fields:
             if self._is_new(field, field.n_assembled):
-                field.block.scale(field.row_scale * field.col_scale)
+                for matrix in field.matrices:
+                    matrix.scale(field.row_scale * field.col_scale)
                 changed = True
         for coupling in self.couplings:
             if self._is_new(coupling, coupling.n_assembled):
@@ -134,6 +135,10 @@ class System:
     def round_off(self, x: PETSc.Vec | None = None) -> float:
         """Return what the norm of the residual at x (the solution if not given) cannot fall below. Collective."""
         return sum(field.round_off(part) for field, part in zip(self.fields, self.values(x), strict=True))
+
+    def rhs_round_off(self) -> float:
+        """Return the norm of what rounding makes of a right-hand side that vanishes. Collective."""
+        return sum(field.rhs_round_off() for field in self.fields)
 
     def values(self, of: PETSc.Vec | None = None) -> list[np.ndarray]:
         """Return the solution (or another vector) of each field on this rank, SI."""

@@ -22,6 +22,9 @@ class Coupling(ABC):
         Grows whenever the pattern of a block changes; the same on all ranks.
     touched : ndarray of bool or None
         This rank's unknowns of the fluid that the coupling acts on; None is none.
+    pushed : ndarray or None
+        T, by this rank's unknowns of the fluid, where the coupling adds J T J^T to the solid's block, kg/(m^4 s)
+        (kg/(m^3 s) in 2D).
     symmetric : bool
         Whether D1 H = J^T, so that iterations for symmetric systems may be used.
     n_coupled, n_assembled : int
@@ -30,6 +33,7 @@ class Coupling(ABC):
 
     blocks: dict[tuple[str, str], PETSc.Mat]
     touched: np.ndarray | None = None
+    pushed: np.ndarray | None = None
     symmetric: bool = False
     pattern_version: int = 0
     n_coupled: int = 0

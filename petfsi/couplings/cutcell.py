@@ -9,10 +9,11 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
-from petfsi.couplings.blocks import TransferBlocks
+from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.fields.base import SolidField, Work
+from petfsi.fields.mac.slivers import outer_products
 from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, gather_triplets
+from petfsi.petsc import IntType, gather_triplets, row_sums, sum_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class CutCellCoupling(Coupling):
         self.facets = self.surface.facets[~self.surface.void]
         self._new_blocks()
         self._positions: np.ndarray | None = None
-        self._stale, self._dt = False, 0.0
+        self._stale, self._dt, self._factor = False, 0.0, 0.0
         self._held = np.zeros(self.surface.point_map.shape[0])
         self._held_outflow = np.zeros(0)
 
@@ -56,13 +57,21 @@ class CutCellCoupling(Coupling):
         self.blocks = self._transfer.by_name
 
     def couple(self, time: float, dt: float) -> None:
-        """Cut the grid and make J; nothing if no point moved."""
+        """Cut the grid and make J, if any point moved, and give the solid the mass of the slivers it pushes."""
         positions, surface = self.solid.surface_positions(), self.solid.surface()
-        if self._positions is not None and surface is self.surface and np.array_equal(positions, self._positions):
-            return
-        if surface is not self.surface:
-            self._take(surface)
-        self._positions = positions.copy()
+        moved = self._positions is None or surface is not self.surface or not np.array_equal(positions, self._positions)
+        if moved:
+            if surface is not self.surface:
+                self._take(surface)
+            self._positions = positions.copy()
+            self._cut(positions)
+        factor = self.fluid.factor(dt)
+        if moved or factor != self._factor:
+            self._factor = factor
+            self.solid.take_mass(self._sliver_mass(factor))
+
+    def _cut(self, positions: np.ndarray) -> None:
+        """Cut the grid and make what walls let through. Collective."""
         walls, wet = self.fluid.cut(positions, self.facets)
         layout = self.fluid.layout
         points = self.facets[walls.facet] * self.dim + walls.axis[:, None]
@@ -72,14 +81,23 @@ class CutCellCoupling(Coupling):
         flux = (self._point_flux @ self._free_map).tocsr()
         flux.sort_indices()
         self.touched = np.diff(flux.indptr) > 0
-        columns = self._free[flux.indices].astype(IntType)
-        cells = layout.start + np.repeat(np.arange(layout.n_local), np.diff(flux.indptr))
-        force = gather_triplets(self.comm, self.solid.layout, columns, cells, -flux.data)
-        self._rows = [(flux.indptr.astype(IntType), columns, flux.data), force]
+        self._flux = flux.indptr.astype(IntType), self._free[flux.indices].astype(IntType), flux.data
         if self.fluid.weight is not None:
             self._weight = self._rest_force(wet)
         self._stale = True
         self.n_coupled += 1
+
+    def _sliver_mass(self, factor: float) -> Rows | None:
+        """Return J T J^T over the slivers with S > 0, this rank's rows of the solid. Collective."""
+        slivers = self.fluid.slivers
+        self.pushed = None
+        if slivers is None or not self.comm.allreduce(bool(np.any(slivers.size > 0.0)), op=MPI.LOR):
+            return None
+        self.pushed = np.zeros(self.fluid.layout.n_local)
+        self.pushed[slivers.slot] = self.fluid.density / factor * np.maximum(slivers.size, 0.0)
+        thick = np.flatnonzero(self.pushed)
+        entries = outer_products(*self._flux, *self._flux, thick, self.pushed[thick])
+        return gather_triplets(self.comm, self.solid.layout, *entries)
 
     def _rest_force(self, wet: Wet) -> csr_matrix:
         """Return the force of a linear pressure, zero in the grid's upper corner, by its gradient. Collective.
@@ -102,15 +120,41 @@ class CutCellCoupling(Coupling):
             self._new_blocks()
         # whoever solves may scale the blocks in place, by amounts that depend on dt
         if self._stale or dt != self._dt:
-            self.pattern_version += self._transfer.fill(*self._rows)
+            self.pattern_version += self._transfer.fill(*self._transfer_rows())
             self.n_assembled += 1
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
             self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
             self._held_outflow = self._point_flux @ self._held
             self.fluid.rhs -= self._held_outflow
+        if self.fluid.slivers is not None:
+            self._press_slivers()
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
+
+    def _transfer_rows(self) -> tuple[Rows, Rows]:
+        """Return this rank's rows of D1 H and -J, with the pressure extrapolated to the walls. Collective."""
+        flux, slivers, layout = self._flux, self.fluid.slivers, self.fluid.layout
+        if slivers is not None:
+            thin = np.flatnonzero(slivers.size < 0.0)
+            weight = self.fluid.density / self._factor * slivers.size[thin]
+            entries = outer_products(*self.fluid.flux_rows, *self._flux, slivers.slot[thin], weight)
+            flux = sum_csr(*flux, *gather_triplets(self.comm, layout, *entries))
+        indptr, columns, values = flux
+        cells = layout.start + np.repeat(np.arange(layout.n_local), np.diff(indptr))
+        return flux, gather_triplets(self.comm, self.solid.layout, columns, cells, -values)
+
+    def _press_slivers(self) -> None:
+        """Let the known outflow act through the slivers, on the solid and on the pressure rows. Collective."""
+        fluid, slivers = self.fluid, self.fluid.slivers
+        assert slivers is not None
+        thick = np.flatnonzero(slivers.size > 0.0)
+        force = fluid.density / self._factor * slivers.size[thick] * fluid.rhs[slivers.slot[thick]]
+        n = fluid.layout.n_local
+        column = np.arange(n + 1), np.zeros(n, dtype=np.int64), np.ones(n)
+        entries = outer_products(*self._flux, *column, slivers.slot[thick], force)
+        self.solid.rhs += row_sums(*gather_triplets(self.comm, self.solid.layout, *entries))
+        fluid.rhs += fluid.spread(fluid.rhs)
 
     def rewind(self) -> None:
         """Make the operators anew, and the fluid's cells with them, in the next step."""
@@ -123,7 +167,12 @@ class CutCellCoupling(Coupling):
             gradient = self.fluid.weight.gradient
             free = float(self.solid.moved @ (self._weight @ gradient))
             held = dt * float(self._held @ (self._point_weight @ gradient))
-        pressed = dt * float(pressure @ self._held_outflow) if len(self._held_outflow) else 0.0
+        pressed = 0.0
+        if self.surface.fixed_map.nnz:
+            outflow = self._held_outflow
+            if self.fluid.slivers is not None:
+                outflow = outflow + self.fluid.spread(outflow, only_thin=False)
+            pressed = dt * float(pressure @ outflow)
         return Work(gravity=free + held, boundary=-pressed - held)
 
     def accept(self, time: float, dt: float) -> None:

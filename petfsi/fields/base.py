@@ -113,6 +113,11 @@ class Field(ABC):
     n_assembled: int = 0
     pattern_version: int = 0
 
+    @property
+    def matrices(self) -> list[PETSc.Mat]:
+        """What the solver scales: the block, and what stands for a part of it in preconditioners."""
+        return [self.block]
+
     @abstractmethod
     def unknown(self) -> np.ndarray:
         """Return the present values of the unknowns on this rank, SI: the first guess of the solve."""
@@ -148,6 +153,10 @@ class Field(ABC):
         comm = self.block.comm.tompi4py()
         length = float(np.sqrt(comm.allreduce(float(x @ x)))) / self.col_scale
         return float(np.finfo(float).eps) * self.block.norm(PETSc.NormType.NORM_INFINITY) * length
+
+    def rhs_round_off(self) -> float:
+        """Return the norm of the rounding in ``rhs``, in the solver's units, where its terms may cancel. Collective."""
+        return 0.0
 
     def relinearise(self, x: np.ndarray) -> bool:
         """Let ``assemble`` linearise about these values (SI) until ``accept``; return whether that changes anything.
@@ -192,13 +201,22 @@ class FluidField(Field):
         Grows whenever cells or faces change their kind; the same on all ranks.
     n_cells : int
         So many of this rank's unknowns, the first ones, are there for the whole run; the others come and go.
+    fluxes : PETSc.Mat
+        What the block consists of for the most part, with a pattern that seldom changes: what preconditioners are made
+        of. May be the block itself. ``pattern_version`` is its.
     """
 
     comm: MPI.Comm
     density: float
     cell_volume: float
     n_cells: int
+    fluxes: PETSc.Mat
     geometry_version: int = 0
+
+    @property
+    def matrices(self) -> list[PETSc.Mat]:
+        """The block and the fluxes, if they are not the same."""
+        return [self.block] if self.fluxes is self.block else [self.block, self.fluxes]
 
     @abstractmethod
     def closed_regions(self, touched: np.ndarray | None) -> list[tuple[np.ndarray, bool]]:
@@ -270,6 +288,13 @@ class SolidField(Field):
     @abstractmethod
     def along_axes(self, x: np.ndarray) -> np.ndarray:
         """Return the velocities along the axes of this rank's nodes from unknowns x (SI), shape (n, dim)."""
+
+    @abstractmethod
+    def take_mass(self, rows: tuple[np.ndarray, np.ndarray, np.ndarray] | None) -> None:
+        """Add these rows (indptr, global columns, values, SI) to every block assembled from now on; None is nothing.
+
+        They are what a surface moves besides the solid. Not collective; all ranks call it.
+        """
 
     @abstractmethod
     def set_scale(self, reference_mass: float) -> None:

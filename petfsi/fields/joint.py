@@ -12,6 +12,7 @@ from scipy.sparse import csr_matrix, vstack
 from petfsi.errors import InputError
 from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work
 from petfsi.fields.solid.field import NodalSolid
+from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, slab
 from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.surfaces import Surface
@@ -95,7 +96,8 @@ class JointSolid(SolidField):
         self._values = np.zeros(starts[-1])
         self.block = new_block(self.comm, self.layout, self.layout)
         set_csr(self.block, self._indptr, self._indices, self._values, new_pattern=True)
-        self._assembled = [0] * len(self.parts)
+        self._added = AddedRows(self.comm)
+        self._assembled = [0] * (len(self.parts) + 1)
         vectors = []
         for modes in zip(*(part.near_null_space() for part in self.parts), strict=True):
             vectors.append(self.block.createVecRight())
@@ -122,16 +124,20 @@ class JointSolid(SolidField):
             part.assemble(time, dt)
         self.rhs[:] = np.concatenate([part.rhs for part in self.parts])
         self.row_scale = self.parts[0].row_scale
-        assembled = [part.n_assembled for part in self.parts]
+        assembled = [*(part.n_assembled for part in self.parts), self._added.version]
         if assembled == self._assembled:
             return
         for n, part in enumerate(self.parts):
             if assembled[n] != self._assembled[n]:
                 self._values[self._entries[n]] = part.rows[2]
         # all of it: whoever solves has scaled the block in place
-        set_csr(self.block, self._indptr, self._indices, self._values, new_pattern=False)
+        self.pattern_version += self._added.fill(self.block, (self._indptr, self._indices, self._values))
         self._assembled = assembled
         self.n_assembled += 1
+
+    def take_mass(self, rows: Rows | None) -> None:
+        """Add these rows to the block from now on."""
+        self._added.take(rows)
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Give every part its velocities."""

@@ -189,6 +189,39 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
 
 
 @njit(cache=True)
+def keep_own(out, own, read, u, v, w, offset, part, courant):
+    """Add to what was advected what an entry has beyond the values that are read, as far as it has not flowed on.
+
+    ``own - read`` belongs to single entries. Advected with linear interpolation it leaves  1 - |displacement|  of
+    itself behind along each axis, in cells; what goes on is lost. So what stands still keeps all of it.
+
+    Parameters
+    ----------
+    out : ndarray
+        The result of sweeps.
+    own, read : ndarray
+        Before them.
+    u, v, w, offset, part
+        As for ``sweep``.
+    courant : tuple of float
+        Time / dx per axis, of all sweeps together.
+    """
+    flat = own.shape[2] == 1
+    (b0, e0), (b1, e1), (b2, e2) = part
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                beyond = own[i, j, k] - read[i, j, k]
+                if beyond == 0.0:
+                    continue
+                a, b, c = velocity_at(u, v, w, i + offset[0], j + offset[1], k + offset[2], flat)
+                left = max(1.0 - abs(courant[0] * a), 0.0) * max(1.0 - abs(courant[1] * b), 0.0)
+                if not flat:
+                    left *= max(1.0 - abs(courant[2] * c), 0.0)
+                out[i, j, k] += left * beyond
+
+
+@njit(cache=True)
 def largest(q):
     """Return the largest magnitude in an array; entries that are not numbers are passed over."""
     most = 0.0

@@ -14,18 +14,21 @@ from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, periodic_axes
-from petfsi.petsc import new_block, set_csr
+from petfsi.fields.mac.slivers import outer_products
+from petfsi.petsc import gather_triplets, new_block, row_sums, set_csr, sum_csr
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.cut import Walls, Wet
     from petfsi.fields.mac.cutgrid import CutGrid, Openings
+    from petfsi.fields.mac.slivers import Slivers
 
 
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
-    "cell_kind", "face_kind", "openness", "narrow", "volume", "extras", "index", "layout", "block", "rhs",
+    "cell_kind", "face_kind", "openness", "narrow", "volume", "slivers", "extras", "index", "layout",
+    "block", "fluxes", "rhs",
 )  # fmt: skip
 
 
@@ -42,12 +45,18 @@ class CoveredGrid(FluidField):
         Face arrays, valid in all ghosts.
     openness : list of ndarray
         Face arrays: how much of a face lets fluid through, see ``cut``; 1 where nothing cuts cells.
+    fluxes : PETSc.Mat
+        L; the block itself unless slivers add to it.
     narrow : list of ndarray of bool or None
         Face arrays, see ``kinds.narrow_faces``; None where nothing cuts cells.
     index : ndarray of IntType
         Cell array of the unknowns' global numbers.
     extras : Extras or None
         Further unknowns, of cells that hold several pieces of fluid.
+    slivers : Slivers or None
+        None where nothing that cuts cells can move.
+    flux_rows : (ndarray, ndarray, ndarray)
+        This rank's rows of L as last assembled, SI: indptr, global columns, values.
     volume : ndarray or None
         Cell array: open part of each cell; None where nothing cuts cells.
     geometry_version, kinds_version : int
@@ -81,12 +90,22 @@ class CoveredGrid(FluidField):
         self.volume: np.ndarray | None = None
         self.geometry_version = self.kinds_version = 0
         self._regions: tuple[int, Regions] | None = None
-        self.block = new_block(comm, self.layout, self.layout)
-        self.rhs = np.zeros(self.layout.n_local)
+        self.slivers: Slivers | None = None
+        self._moves = self._cutter is not None and bool(scene.solids)
+        self._new_blocks()
         self._pattern = pressure.Pattern(grid)
         self._assembled_for: tuple[int, float] | None = None
+        self.flux_rows = self._pattern.indptr, self._pattern.indices, np.zeros(len(self._pattern.indices))
+        self._block_pattern: tuple[np.ndarray, np.ndarray] | None = None
         self._new_pattern = True
         self._before: dict[str, Any] = {}
+
+    def _new_blocks(self) -> None:
+        """Make matrices and right-hand side for the present layout. Collective."""
+        self.block = self.fluxes = new_block(self.comm, self.layout, self.layout)
+        if self._moves:  # then slivers set the two apart
+            self.block = new_block(self.comm, self.layout, self.layout)
+        self.rhs = np.zeros(self.layout.n_local)
 
     def _uncover(self) -> None:
         """Start with what obstacles leave. Collective."""
@@ -161,6 +180,7 @@ class CoveredGrid(FluidField):
         elif wider:
             self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
+        self.slivers = found.slivers if self._moves else None
         self.geometry_version += 1
         return found.walls, found.wet
 
@@ -175,7 +195,7 @@ class CoveredGrid(FluidField):
         self._before = {}
         self.geometry_version += 1
         self._kinds_changed()
-        self._assembled_for, self._new_pattern = None, True
+        self._assembled_for, self._new_pattern, self._block_pattern = None, True, None
 
     def _renumber(self, found: Openings) -> None:
         """Take over the unknowns of split cells; the others keep their place. Collective."""
@@ -183,9 +203,8 @@ class CoveredGrid(FluidField):
         self.extras, self.index = found.extras, found.index
         # an unknown that goes from one rank to another changes nothing on a third, which must take part
         if self.comm.allreduce(found.layout != self.layout, op=MPI.LOR):
-            self.layout = found.layout
-            self.block = new_block(self.comm, self.layout, self.layout)
-            self.rhs = np.zeros(self.layout.n_local)
+            self.layout, self._block_pattern = found.layout, None
+            self._new_blocks()
 
     def _kinds_changed(self) -> None:
         """Refresh what follows from the kinds. Collective."""
@@ -233,7 +252,7 @@ class CoveredGrid(FluidField):
         """Refresh what follows from where the flow can be read. Collective."""
 
     def _assemble_block(self, factor: float) -> None:
-        """Fill L for the step's factor (see ``transport``). Collective."""
+        """Fill L, and L + L T L, for the step's factor (see ``transport``). Collective."""
         grid, pattern = self.grid, self._pattern
         c = factor / self.density * grid.cell_volume / grid.dx**2
         values = np.zeros(len(pattern.indices))
@@ -242,11 +261,43 @@ class CoveredGrid(FluidField):
         rows = pattern.indptr, pattern.indices, values
         if self.extras is not None:
             rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
-        set_csr(self.block, *rows, new_pattern=self._new_pattern)
+        set_csr(self.fluxes, *rows, new_pattern=self._new_pattern)
         self.pattern_version += self._new_pattern
         self._new_pattern = False
+        self.flux_rows = rows
+        if self.slivers is not None:
+            self._fill_block(self.slivers, factor)
         self._assembled_for = (self.geometry_version, factor)
         self.n_assembled += 1
+
+    def _fill_block(self, slivers: Slivers, factor: float) -> None:
+        """Fill the block with L + L T L over the slivers with S < 0. Collective."""
+        thin = np.flatnonzero(slivers.size < 0.0)
+        weight = self.density / factor * slivers.size[thin]
+        entries = outer_products(*self.flux_rows, *self.flux_rows, slivers.slot[thin], weight)
+        rows = sum_csr(*self.flux_rows, *gather_triplets(self.comm, self.layout, *entries))
+        known = self._block_pattern
+        new = known is None or not all(map(np.array_equal, known, rows[:2]))
+        set_csr(self.block, *rows, new_pattern=self.comm.allreduce(new, op=MPI.LOR))
+        self._block_pattern = rows[:2]
+
+    def spread(self, outflow: np.ndarray, only_thin: bool = True) -> np.ndarray:
+        """Return L T times a net outflow of each of this rank's unknowns, m^3/s (m^2/s in 2D). Collective.
+
+        Parameters
+        ----------
+        outflow : ndarray, shape (layout.n_local,)
+        only_thin : bool
+            Whether slivers with S > 0 are left out, as the system's rows leave them to the solid.
+        """
+        slivers = self.slivers
+        assert slivers is not None and self._assembled_for is not None
+        use = np.flatnonzero((slivers.size < 0.0) | (not only_thin))
+        weight = self.density / self._assembled_for[1] * slivers.size[use] * outflow[slivers.slot[use]]
+        n = len(outflow)
+        column = np.arange(n + 1), np.zeros(n, dtype=np.int64), np.ones(n)
+        entries = outer_products(*self.flux_rows, *column, slivers.slot[use], weight)
+        return row_sums(*gather_triplets(self.comm, self.layout, *entries))
 
     def _part(self, axis: int | None) -> tuple[tuple[int, int], ...]:
         """Return the owned ranges of faces of ``axis`` (cells: None)."""

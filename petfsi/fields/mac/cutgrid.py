@@ -13,6 +13,7 @@ from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, links_of, pa
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.sides import Surroundings
+from petfsi.fields.mac.slivers import Slivers, slivers_of
 from petfsi.geometry.clipping import CutCells, Lattice, cut
 from petfsi.petsc import IntType, Layout
 
@@ -41,6 +42,8 @@ class Openings:
         Slots are global numbers of unknowns; entries of unknowns that are not solved are left out.
     wet : Wet
         About the upper corner of the grid.
+    slivers : Slivers
+        Of this rank's unknowns that are solved, by their local numbers.
     """
 
     cell_kind: np.ndarray
@@ -53,6 +56,7 @@ class Openings:
     extras: Extras | None
     walls: Walls
     wet: Wet
+    slivers: Slivers
 
 
 class CutGrid:
@@ -118,7 +122,8 @@ class CutGrid:
         links = self._without_walls(links_of(found, self.shape))
         slot = patch_slots(found, len(self._flat))
         walls = walls_of(found, slot, len(facets))
-        openness, split = self._openness(found, links)
+        whole = self._whole_openings(found)
+        openness, split = self._openness(whole, links)
         volume = grid.zeros_cells()
         self._part(volume, None)[...] = found.volume
         grid.exchange_cells(volume)
@@ -128,21 +133,35 @@ class CutGrid:
         solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
         walls = Walls(walls.facet[used], walls.axis[used], numbers[walls.slot[used]], walls.flux[used])
+        slivers = slivers_of(found, slot, len(facets), links, grid.dx, len(numbers))
+        used = np.flatnonzero(solved[slivers.slot])
+        slivers = Slivers(numbers[slivers.slot[used]] - layout.start, slivers.size[used], slivers.normal[used])
         patches = np.flatnonzero(solved[slot] & (found.facet < len(facets)))
         wet = first_moments(found, patches, self._centres(found.cell[patches]))
-        narrow = self._narrow(openness, face_kind)
-        return Openings(cell_kind, face_kind, openness, narrow, volume, layout, index, extras, walls, wet)
+        narrow = self._narrow(whole, face_kind)
+        return Openings(cell_kind, face_kind, openness, narrow, volume, layout, index, extras, walls, wet, slivers)
 
-    def _openness(self, found: CutCells, links: Links) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the openness of local faces by axis, zero where split, and which are split (flat). Collective."""
-        openness, split = [], []
+    def _whole_openings(self, found: CutCells) -> list[np.ndarray]:
+        """Return the open fractions of local faces by axis, split or not. Collective."""
+        openings = []
         for a in range(self.grid.dim):
             whole = self.grid.zeros_faces(a)
             self._part(whole, a)[...] = found.open[a]
-            torn = np.unique(self._flat_faces[a][links.face[(links.axis == a) & links.split]])
-            whole.reshape(-1)[torn] = 0.0
             self.grid.exchange_faces(a, whole)
-            openness.append(whole)
+            openings.append(whole)
+        return openings
+
+    def _openness(self, whole: list[np.ndarray], links: Links) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the openness of local faces by axis, zero where split, and which are split (flat). Collective."""
+        openness, split = [], []
+        for a in range(self.grid.dim):
+            torn = np.unique(self._flat_faces[a][links.face[(links.axis == a) & links.split]])
+            opening = whole[a]
+            if self.grid.comm.allreduce(len(torn) > 0, op=MPI.LOR):
+                opening = opening.copy()
+                opening.reshape(-1)[torn] = 0.0
+                self.grid.exchange_faces(a, opening)
+            openness.append(opening)
             split.append(torn)
         return openness, split
 

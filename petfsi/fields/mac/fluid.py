@@ -133,11 +133,15 @@ class MacFluid(CoveredGrid):
             extra = extra if self.extras is None else extra - rest.reshape(-1)[self.extras.cell]
         return np.concatenate((cells, extra))
 
+    def factor(self, dt: float) -> float:
+        """Return c, how long an acceleration acts on the solution of a step of dt, s."""
+        return self._transport.factor(dt)
+
     def predict(self, time: float, dt: float) -> None:
         """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
         self._remember("smoke", "_extra_pressure")
         transport = self._transport
-        transport.predict(self._moved, dt, self.velocity_star)
+        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         moment, smoke = transport.moment(dt), self.smoke
         if self.smoke is not None and self._smoke_band is not None:
             old = self.smoke
@@ -180,33 +184,20 @@ class MacFluid(CoveredGrid):
         grid = self.grid
         dx = grid.cell_volume ** (1.0 / self.dim)
         self.row_scale, self.col_scale = 1.0 / dx ** (self.dim - 1), self.density * dx / dt
-        part = self._part(None)
-        factor = self._transport.factor(dt)
+        factor = self.factor(dt)
         if self._assembled_for != (self.geometry_version, factor):
             self._assemble_block(factor)
-        self.rhs[:] = 0.0
-        areas = np.array([grid.face_area(axis) for axis in self._axes])
-        for axis in self._axes:
-            pressure.known_inflow(
-                self._active,
-                self.velocity_star[axis],
-                self.boundary_velocity[axis],
-                self.face_kind[axis],
-                self.openness[axis],
-                kinds.STEP[axis],
-                areas[axis],
-                part,
-                self.rhs,
-            )
-        if self.extras is not None:
-            self.extras.add_inflow(self.velocity_star, areas, self.layout, self.rhs)
+        self.rhs[:] = -self._outflow(self.velocity_star)
 
-    def round_off(self, x: np.ndarray) -> float:
-        """Return eps (||L|| ||p|| + ||A v*||): net outflows are differences of what goes in and out. Collective."""
+    def rhs_round_off(self) -> float:
+        """Return eps ||A v*||: net outflows are differences of what goes in and out. Collective."""
         stars = [star[self.grid.owned(axis)] for axis, star in enumerate(self.velocity_star)]
         squares = sum(self.grid.face_area(axis) ** 2 * float(np.vdot(v, v)) for axis, v in enumerate(stars))
-        flow = float(np.sqrt(self.comm.allreduce(squares)))
-        return super().round_off(x) + float(np.finfo(float).eps) * self.row_scale * flow
+        return float(np.finfo(float).eps) * self.row_scale * float(np.sqrt(self.comm.allreduce(squares)))
+
+    def round_off(self, x: np.ndarray) -> float:
+        """Return eps (||L|| ||p|| + ||A v*||). Collective."""
+        return super().round_off(x) + self.rhs_round_off()
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the pressure and set the velocity that goes with it. Collective.
@@ -290,7 +281,26 @@ class MacFluid(CoveredGrid):
         kick, see ``transport``.
         """
         velocity = self._transport.kicked(self.velocity)
-        return budget.stock(self.grid, self.density, velocity, self.face_kind, self.openness, self.extras)
+        stock = budget.stock(self.grid, self.density, velocity, self.face_kind, self.openness, self.extras)
+        if self.slivers is None:
+            return stock
+        flow = self._outflow(velocity)[self.slivers.slot]
+        pushed = self.density * self.slivers.size * flow
+        kinetic = 0.5 * float(pushed @ flow)
+        return Stock(stock.momentum + pushed @ self.slivers.normal, stock.kinetic + kinetic)
+
+    def _outflow(self, velocity: list[np.ndarray]) -> np.ndarray:
+        """Return the net outflow of each of this rank's unknowns through its faces, m^3/s (m^2/s in 2D)."""
+        inflow = np.zeros(self.layout.n_local)
+        areas = np.array([self.grid.face_area(axis) for axis in self._axes])
+        for axis in self._axes:
+            pressure.known_inflow(
+                self._active, velocity[axis], self.boundary_velocity[axis], self.face_kind[axis], self.openness[axis],
+                kinds.STEP[axis], areas[axis], self._part(None), inflow,
+            )  # fmt: skip
+        if self.extras is not None:
+            self.extras.add_inflow(velocity, areas, self.layout, inflow)
+        return -inflow
 
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted, see ``budget``."""

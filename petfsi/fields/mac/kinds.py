@@ -39,7 +39,7 @@ def narrow_faces(openness, face_kind, across, narrow):
     Parameters
     ----------
     openness, face_kind : ndarray
-        Face arrays.
+        Face arrays; of a split face all of its parts count.
     across : tuple of (int, int, int)
         The unit steps along the other axes.
     narrow : ndarray of bool
@@ -51,7 +51,8 @@ def narrow_faces(openness, face_kind, across, narrow):
         for j in range(1, n1 - 1):
             for k in range(0 if flat else 1, 1 if flat else n2 - 1):
                 narrow[i, j, k] = False
-                if face_kind[i, j, k] != PRESSURE or openness[i, j, k] >= NARROW:
+                kind = face_kind[i, j, k]
+                if (kind != PRESSURE and kind != SPLIT) or openness[i, j, k] >= NARROW:
                     continue
                 for di, dj, dk in across:
                     widest = max(openness[i - di, j - dj, k - dk], openness[i + di, j + dj, k + dk])

@@ -123,6 +123,12 @@ class Advection:
                     grid.fill_sides(target, axis)
                 q = target
 
+    def keep_own(self, own: np.ndarray, read: np.ndarray, path: Path, axis: int, out: np.ndarray) -> None:
+        """Add to faces carried from ``read`` what they have beyond it, as far as it has not flowed on."""
+        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
+        part = tuple((s.start, s.stop) for s in self.grid.owned(axis))
+        advect.keep_own(out, own, read, *three(path.velocity), offset, part, (*(path.span / self.grid.dx), 0.0)[:3])
+
 
 class Transport:
     """First order, for Newmark's and the symplectic scheme:  v*(x) = v^n(x_d), where x_d comes to x along v^n.
@@ -171,7 +177,7 @@ class Transport:
         """Return the flow that carries from the step's begin to its end."""
         return self.carried
 
-    def predict(self, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+    def predict(self, moved: list[np.ndarray], dt: float, star: Faces, extend: Extend) -> None:
         """Write what is carried to the owned faces into ``star``. Collective."""
         self._whole = self.advection.path(self.half_way(dt), dt)
         for axis, v in enumerate(self.carried):
@@ -230,9 +236,9 @@ class Bdf2Transport(Transport):
         s = later / self.past_dt
         return [v + s * (v - before) for v, before in zip(self.carried, self.past["velocity_before"], strict=True)]
 
-    def predict(self, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+    def predict(self, moved: list[np.ndarray], dt: float, star: Faces, extend: Extend) -> None:
         """Write b v^n(x_d) - b' v^{n-1}(x_dd) into the owned part of ``star``. Collective."""
-        super().predict(moved, dt, star)
+        super().predict(moved, dt, star, extend)
         if self.past_dt == 0.0:
             return
         b, b_past = self.scheme.weights(dt, self.past_dt)
@@ -258,7 +264,8 @@ class MidpointTransport(Transport):
         v'(x) = v''(x_d),    v_w = v' + (h/2)(g - G p / rho),    v'' = 2 v_w - v' .
 
     Paths, and the velocity that others see at the ends of steps, lie on the line through the last two v_w. Where a
-    face has its velocity given, v'' is the one at the step's end.
+    face has its velocity given, v'' is the one at the step's end. Faces that others do not read keep their own v'' as
+    far as it has not flowed on, or transport would take energy where nothing moves.
 
     References
     ----------
@@ -271,6 +278,7 @@ class MidpointTransport(Transport):
         super().__init__(advection)
         self.scheme = self.integrator = Midpoint()
         self._start: Faces = []
+        self._read: Faces | None = None  # v'' as others read it
         self._last: tuple[Faces, Faces] | None = None
 
     def solved(self, velocity: Faces) -> Faces:
@@ -290,12 +298,16 @@ class MidpointTransport(Transport):
         pairs = zip(self.carried, self.past["velocity_middle"], strict=True)
         return [self.scheme.later(v, w, later, self.past_dt) for v, w in pairs]
 
-    def predict(self, moved: list[np.ndarray], dt: float, star: Faces) -> None:
+    def predict(self, moved: list[np.ndarray], dt: float, star: Faces, extend: Extend) -> None:
         """Write v' into the owned part of ``star``, and keep it for the kick. Collective."""
         between = (self.past_dt + dt) / 2
         path = self.advection.path(self._at((dt - self.past_dt) / 4), between)
-        for axis, v in enumerate(self.past["velocity_kicked"] if self.past_dt else self.carried):
+        own = self.past["velocity_kicked"] if self.past_dt else self.carried
+        if self._read is None:  # a run that is resumed
+            self._read = extend([v.copy() for v in own]) if self.past_dt else own
+        for axis, v in enumerate(self._read):
             self.advection.carry(v, path, moved[axis], axis, star[axis])
+            self.advection.keep_own(own[axis], v, path, axis, star[axis])
         self._start = [v.copy() for v in star]
 
     def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
@@ -309,7 +321,8 @@ class MidpointTransport(Transport):
             np.where(where, end, 2 * w - start)
             for where, end, w, start in zip(given, ahead, solved, self._start, strict=True)
         ]
-        self.past = {"velocity_middle": middle, "velocity_kicked": extend(kicked)}
+        self._read = extend(kicked)
+        self.past = {"velocity_middle": middle, "velocity_kicked": kicked}
         self.past_dt, self._start, self._last = dt, [], (solved, kicked)
         return ahead
 

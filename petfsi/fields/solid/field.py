@@ -16,6 +16,7 @@ from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.lumped import LumpedEquation
+from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.spectrum import largest_eigenvalue
@@ -162,7 +163,8 @@ class NodalSolid(SolidField):
             vectors.append(vector)
         self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
         self._diagonal = (0.0, 0.0), 1.0
-        self._assembled_for = 0.0, 0.0, 0.0, 0.0  # a, k, dt and the mass in row_scale
+        self._assembled_for = 0.0, 0.0, 0.0, 0.0, 0  # a, k, dt, the mass in row_scale, and what was added
+        self._added = AddedRows(self.comm)
 
     @property
     def rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,7 +201,7 @@ class NodalSolid(SolidField):
         b = self.rhs.reshape(-1, self.width)
         local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
         state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
-        made_for = stage.a, stage.k, dt, self._reference_mass
+        made_for = stage.a, stage.k, dt, self._reference_mass, self._added.version
         values = None if self.is_linear and made_for == self._assembled_for else self._values
         if values is None:  # A is still the same
             self._elements.forces(state, b)
@@ -212,9 +214,8 @@ class NodalSolid(SolidField):
         self._prescribe(stage, time, dt)
         if values is not None:
             self._elimination.empty(values, diagonal)
-            set_csr(self.block, self._pattern.indptr, self._pattern.indices, values, new_pattern=False)
+            self._fill(self._pattern.indptr, self._pattern.indices)
             self._assembled_for = made_for
-            self.n_assembled += 1
         self._elimination.prescribe(self.rhs, self._prescribed)
         self.row_scale = dt / self._reference_mass
 
@@ -240,12 +241,21 @@ class NodalSolid(SolidField):
             self._pull = b.copy()
         self._prescribe(stage, time, dt)
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
-        if self._assembled_for != (stage.a, 0.0, dt, mean):
-            self._assembled_for = stage.a, 0.0, dt, mean
+        made_for = stage.a, 0.0, dt, mean, self._added.version
+        if self._assembled_for != made_for:
+            self._assembled_for = made_for
             self._values[:] = lumped.diagonal(stage.a, mean)
-            set_csr(self.block, lumped.indptr, lumped.indices, self._values, new_pattern=False)
-            self.n_assembled += 1
+            self._fill(lumped.indptr, lumped.indices)
         self.row_scale = dt / mean
+
+    def _fill(self, indptr: np.ndarray, indices: np.ndarray) -> None:
+        """Fill the block with A's values and what was added. Collective."""
+        self.pattern_version += self._added.fill(self.block, (indptr, indices, self._values))
+        self.n_assembled += 1
+
+    def take_mass(self, rows: Rows | None) -> None:
+        """Add these rows to A from now on."""
+        self._added.take(rows)
 
     def _add_weight(self, time: float, dt: float) -> np.ndarray:
         """Add gravity's force to b and return it, m/s^2."""
