@@ -50,9 +50,9 @@ def new_block(comm: MPI.Comm, rows: Layout, cols: Layout, block_size: int = 1) -
     mat.setType(PETSc.Mat.Type.AIJ)
     if block_size > 1:
         mat.setBlockSize(block_size)
-    else:
-        forget_inodes(mat)
     mat.setUp()
+    if block_size == 1:
+        forget_inodes(mat)
     return mat
 
 

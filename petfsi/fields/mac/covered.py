@@ -171,7 +171,7 @@ class CoveredGrid(FluidField):
         if found.extras is not None or self.extras is not None:
             changed = changed or found.extras is None or not found.extras.same(self.extras)
         wider = self.narrow is None or any(map(np.any, map(np.not_equal, found.narrow, self.narrow)))
-        changed, wider = self.comm.allreduce(np.array([changed, wider]), op=MPI.LOR)
+        changed, wider = self.comm.allreduce(np.array([changed, wider], dtype=int)) > 0
         self.narrow = found.narrow
         if changed:
             self._renumber(found)
