@@ -26,10 +26,11 @@ from solid_cases import (
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.materials import lame_parameters
 from petfsi.fields.solid.patches import barycentric_gradients, grouped_mesh, grown_patches
-from petfsi.fields.solid.rules import _forms, quadratic_rule, shape_functions
+from petfsi.fields.solid.rules import quadratic_rule, shape_functions
 from petfsi.fields.solid.spectrum import TOLERANCE, largest_eigenvalue
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.meshes import box_mesh
+from petfsi.geometry.quadratic import shape_forms
 from petfsi.scene.schema import Ball, Box
 
 KINDS = [(order, rule) for order in ("linear", "quadratic") for rule in ("full", "reduced")]
@@ -202,7 +203,7 @@ def static_error(dim, n, kind):
     value, slope = [], []
     for at in np.concatenate((0.8 * np.eye(dim + 1) + 0.2 / (dim + 1), np.full((1, dim + 1), 1 / (dim + 1)))):
         N = shape_functions(at, nodes.shape[1])
-        table = np.eye(dim + 1) if nodes.shape[1] == dim + 1 else 2 * _forms(dim) @ at
+        table = np.eye(dim + 1) if nodes.shape[1] == dim + 1 else 2 * shape_forms(dim) @ at
         u, gradient, _ = exact(np.einsum("a,eaj->ej", at, mesh.points[nodes[:, : dim + 1]]))
         value.append(np.einsum("a,eai->ei", N, d[nodes]) - u)
         slope.append(np.einsum("am,emj,eai->eij", table, gradients, d[nodes]) - gradient)

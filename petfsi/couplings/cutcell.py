@@ -36,8 +36,6 @@ class CutCellCoupling(Coupling):
         self.comm: MPI.Comm = fluid.comm
         self.dim = fluid.dim
         self._take(solid.surface())
-        # a cavity that holds nothing is no room for the fluid: without its walls it counts as solid
-        self.facets = self.surface.facets[~self.surface.void]
         self._new_blocks()
         self._positions: np.ndarray | None = None
         self._stale, self._dt, self._factor = False, 0.0, 0.0
@@ -46,6 +44,13 @@ class CutCellCoupling(Coupling):
 
     def _take(self, surface: Surface) -> None:
         self.surface = surface
+        # a cavity that holds nothing is no room for the fluid: without its walls it counts as solid
+        wet = ~surface.void
+        self.facets = surface.facets[wet]
+        self.nodes, self.curved = self.facets, None
+        if surface.curved is not None:
+            self.curved = surface.curved.take(wet)
+            self.nodes = self.curved.nodes
         # the surface's own unknowns alone, so that no product runs over all of the solid's
         self._free = np.unique(surface.point_map.indices)
         self._free_map = surface.point_map[:, self._free]
@@ -72,10 +77,10 @@ class CutCellCoupling(Coupling):
 
     def _cut(self, positions: np.ndarray) -> None:
         """Cut the grid and make what walls let through. Collective."""
-        walls, wet = self.fluid.cut(positions, self.facets)
+        walls, wet = self.fluid.cut(positions, self.facets, None if self.curved is None else self.curved.part)
         layout = self.fluid.layout
-        points = self.facets[walls.facet] * self.dim + walls.axis[:, None]
-        rows = np.repeat(walls.slot - layout.start, self.dim)
+        points = self.nodes[walls.facet] * self.dim + walls.axis[:, None]
+        rows = np.repeat(walls.slot - layout.start, self.nodes.shape[1])
         shape = (layout.n_local, self._free_map.shape[0])
         self._point_flux = csr_matrix((walls.flux.ravel(), (rows, points.ravel())), shape=shape)
         flux = (self._point_flux @ self._free_map).tocsr()
@@ -105,7 +110,7 @@ class CutCellCoupling(Coupling):
         Shape (unknowns of the solid on this rank, dim), m^3 (m^2 in 2D):  -∫ N_i n (x_b - x_0,b) dA.
         """
         dim, layout = self.dim, self.solid.layout
-        points = (self.facets[wet.facet] * dim)[:, :, None] + np.arange(dim)
+        points = (self.nodes[wet.facet] * dim)[:, :, None] + np.arange(dim)
         rows = np.repeat(points.ravel(), dim)
         columns = np.tile(np.arange(dim), points.size)
         self._point_weight = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))

@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from scipy.sparse import csr_matrix
 
+from petfsi.geometry.quadratic import Curved
+
 # A stencil whose usable cells weigh less than this in sum says too little about the point.
 _LEAST_WEIGHT = 1e-3
 # A fluid cell whose centre lies in the facet's plane up to rounding is still in front of it (in cell sizes).
@@ -63,17 +65,17 @@ def pieces_per_edge(points: np.ndarray, facets: np.ndarray, dx: np.ndarray, quad
 
 
 def pressure_integrals(
-    points: np.ndarray, facets: np.ndarray, box: Box, usable: np.ndarray, quadrature: int
+    points: np.ndarray, facets: np.ndarray, box: Box, usable: np.ndarray, quadrature: int, curved: Curved | None = None
 ) -> tuple[csr_matrix, csr_matrix]:
     """Return this rank's share of the integrals of facet shape functions times the pressure, in two factors.
 
-    Their product S holds S[f * dim + i, c], with
+    Their product S holds S[f * width + i, c], with the facet's functions i (``width`` of them),
 
-        Σ_c S[f * dim + i, c] p_c = 1 / |f| ∫_f N_i p dA ,
+        Σ_c S[f * width + i, c] p_c = 1 / |f| ∫_f N_i p dA ,
 
-    by the midpoint rule on equal pieces of the facet (exact for linear integrands), with p(x) interpolated linearly
-    along each axis among those cells of the stencil around x that are usable and not behind the facet. Each
-    quadrature point belongs to the rank that owns its cell. Not collective.
+    by the mean of N_i over equal pieces of the facet and p in the middle of each (exact for a uniform p), with p(x)
+    interpolated linearly along each axis among those cells of the stencil around x that are usable and not behind
+    the facet. Each piece belongs to the rank that owns its middle's cell. Not collective.
 
     Parameters
     ----------
@@ -85,10 +87,12 @@ def pressure_integrals(
         Cells that have a pressure, in the local shape with ghosts.
     quadrature : int
         Facets are cut until no piece is longer than a cell divided by this.
+    curved : Curved or None
+        What functions parts of quadratic facets have; others the hat functions of their corners.
 
     Returns
     -------
-    shape_weights : csr_matrix, shape (n_facets * dim, n_quadrature)
+    shape_weights : csr_matrix, shape (n_facets * width, n_quadrature)
     stencils : csr_matrix, shape (n_quadrature, usable.size)
         Rows sum to one; columns are flat local cells.
     """
@@ -109,10 +113,13 @@ def pressure_integrals(
         strides, usable.ravel(), facet, shapes, cells, weights,
     )  # fmt: skip
     facet, shapes, cells, weights = facet[:n], shapes[:n], cells[:n], weights[:n]
+    if curved is not None:
+        shapes = curved.means(facet, shapes, pieces[facet])
     shapes = shapes / pieces[facet, None] ** (dim - 1)
-    rows = np.arange(0, n * dim + 1, dim)
+    width = shapes.shape[1]
+    rows = np.arange(0, n * width + 1, width)
     shape_weights = csr_matrix(
-        (shapes.ravel(), (facet[:, None] * dim + np.arange(dim)).ravel(), rows), shape=(n, len(facets) * dim)
+        (shapes.ravel(), (facet[:, None] * width + np.arange(width)).ravel(), rows), shape=(n, len(facets) * width)
     ).T.tocsr()
     used = weights.ravel() != 0.0
     indptr = np.concatenate(([0], np.cumsum(used.reshape(n, 2**dim).sum(axis=1))))
@@ -134,7 +141,7 @@ def _sample(
     corners, normals, pieces, near, origin, dx, n_cells, periodic, lo, hi, ghost, strides, usable,
     facet, shapes, cells, weights,
 ):  # fmt: skip
-    """Fill facet, shape functions and stencil of each quadrature point of this rank; return their number."""
+    """Fill facet, barycentric coordinates and stencil of each quadrature point of this rank; return their number."""
     dim = len(dx)
     n = 0
     s = np.empty(dim)

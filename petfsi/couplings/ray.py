@@ -174,8 +174,10 @@ class RayCoupling(Coupling):
         self.touched_cells[...] = False
         rows, cols, values = [], [], []
         for a, faces in enumerate(self._faces):
-            points = self.surface.facets[faces.facet] * self.dim + a
-            moves = np.any(free[points] & (faces.weights != 0.0), axis=1)
+            points = self.surface.nodes[faces.facet] * self.dim + a
+            shapes = self.surface.shape_functions(faces.facet, faces.weights)
+            width = shapes.shape[1]
+            moves = np.any(free[points] & (shapes != 0.0), axis=1)
             above = np.array(np.unravel_index(faces.segment, self.fluid.face_kind[a].shape))
             below = above.copy()
             below[a] -= 1
@@ -184,9 +186,9 @@ class RayCoupling(Coupling):
                 local = local[kind[tuple(cell[:, local])] == FLUID]
                 self.touched_cells[tuple(cell[:, local[moves[local]]])] = True
                 mine = local[owned[tuple(cell[:, local])]]
-                rows.append(np.repeat(grid.index[tuple(cell[:, mine])] - layout.start, self.dim))
+                rows.append(np.repeat(grid.index[tuple(cell[:, mine])] - layout.start, width))
                 cols.append(points[mine].reshape(-1))
-                values.append(sign * grid.face_area(a) * faces.weights[mine].reshape(-1))
+                values.append(sign * grid.face_area(a) * shapes[mine].reshape(-1))
         entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
         return csr_matrix(entries, shape=(layout.n_local, self._free_map.shape[0]))
 
@@ -198,15 +200,17 @@ class RayCoupling(Coupling):
 
     def _force_rows(self, positions: np.ndarray) -> Rows:
         """Return this rank's rows of -J. Collective."""
-        facets = self.surface.facets[self.wet]
+        facets, nodes, curved = self.surface.facets[self.wet], self.surface.nodes[self.wet], self.surface.curved
+        if curved is not None:
+            curved = curved.take(self.wet)
         usable = (self.fluid.cell_kind == FLUID) & (self.grid.index >= 0)
-        shape_weights, stencils = pressure_integrals(positions, facets, self.box, usable, self.quadrature)
-        # point * dim + axis by facet * dim + corner: each corner's force is along the facet's normal
-        n, dim = len(facets), self.dim
-        corner = np.broadcast_to(np.arange(n * dim).reshape(n, dim, 1), (n, dim, dim))
-        point = facets[:, :, None] * dim + np.arange(dim)
-        normal = np.broadcast_to(area_normals(positions, facets)[:, None, :], (n, dim, dim))
-        spread = csr_matrix((normal.ravel(), (point.ravel(), corner.ravel())), shape=(self._free_map.shape[0], n * dim))
+        shape_weights, stencils = pressure_integrals(positions, facets, self.box, usable, self.quadrature, curved)
+        # point * dim + axis by facet * width + node: each node's force is along the facet's normal
+        (n, width), dim = nodes.shape, self.dim
+        node = np.broadcast_to(np.arange(n * width).reshape(n, width, 1), (n, width, dim))
+        point = nodes[:, :, None] * dim + np.arange(dim)
+        normal = np.broadcast_to(area_normals(positions, facets)[:, None, :], (n, width, dim))
+        spread = csr_matrix((normal.ravel(), (point.ravel(), node.ravel())), shape=(self._free_map.shape[0], n * width))
         force = ((self._free_map.T @ spread) @ (shape_weights @ stencils)).tocoo()
         cells = self.grid.index.reshape(-1)[force.col]
         return gather_triplets(self.comm, self.solid.layout, self._free[force.row], cells, force.data)
@@ -237,5 +241,6 @@ class RayCoupling(Coupling):
         """Give the faces that the solid took its new velocity, in ghosts, too."""
         velocity = self.solid.surface_velocity()
         for a, faces in enumerate(self._faces):
-            moved = np.sum(faces.weights * velocity[self.surface.facets[faces.facet], a], axis=1)
+            shapes = self.surface.shape_functions(faces.facet, faces.weights)
+            moved = np.sum(shapes * velocity[self.surface.nodes[faces.facet], a], axis=1)
             self.fluid.boundary_velocity[a].reshape(-1)[faces.segment] = moved

@@ -15,6 +15,7 @@ from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, slab
 from petfsi.geometry.bodies import build_bodies
+from petfsi.geometry.quadratic import Curved
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, Layout, new_block, set_csr
 from petfsi.ranks import on_root
@@ -216,12 +217,15 @@ class JointSolid(SolidField):
 
     def _joined(self, surfaces: list[Surface]) -> Surface:
         first = np.cumsum([0] + [surface.n_points for surface in surfaces])
+        facets = [s.facets + n for s, n in zip(surfaces, first, strict=False)]
+        curved = [s.curved and s.curved._replace(nodes=s.nodes + n) for s, n in zip(surfaces, first, strict=False)]
         return Surface(
-            facets=np.concatenate([s.facets + n for s, n in zip(surfaces, first, strict=False)]),
+            facets=np.concatenate(facets),
             cavity=np.concatenate([s.cavity for s in surfaces]),
             void=np.concatenate([s.void for s in surfaces]),
             point_map=self._joined_map([s.point_map for s in surfaces]),
             fixed_map=self._joined_map([s.fixed_map for s in surfaces]),
+            curved=Curved.joined(list(zip(facets, curved, strict=True))),
         )
 
     def _joined_map(self, maps: list[csr_matrix]) -> csr_matrix:

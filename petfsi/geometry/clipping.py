@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from petfsi.geometry.node_moments import node_integrals
 from petfsi.geometry.patches import Frame, Patches, find_patches
 from petfsi.geometry.pieces import Box, find_pieces
 from petfsi.geometry.slabs import area_vectors, to_lattice
@@ -69,9 +70,10 @@ class CutCells:
         Flat index (C order) in the box.
     piece : ndarray of int32, shape (n,)
         The piece of fluid that the patch bounds.
-    integrals : ndarray, shape (n, dim)
-        int N_i dA over the patch, m^2 (m in 2D), i the facet's corners.
-    moments : ndarray, shape (n, dim, dim)
+    integrals : ndarray, shape (n, width)
+        int N_i dA over the patch, m^2 (m in 2D), i the facet's corners, or its nodes if some facets are parts of
+        quadratic ones (see ``quadratic.Curved``).
+    moments : ndarray, shape (n, width, dim)
         int N_i (x_a - centre_a) dA, [patch, i, a], m^3 (m^2), about the centre of the cell (of the image it lies in).
     normals : ndarray, shape (n_facets, dim)
         The facets' unit normals as they were cut (vertices in planes are moved a little); ``integrals`` times these
@@ -107,7 +109,9 @@ class CutCells:
     link_open: np.ndarray
 
 
-def cut(points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0) -> CutCells:
+def cut(
+    points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0, part: np.ndarray | None = None
+) -> CutCells:
     """Return a closed surface cut by the cells of a lattice.
 
     Parameters
@@ -120,6 +124,8 @@ def cut(points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0)
     lattice : Lattice
     base : int
         How many of the solids reach to infinity (containers).
+    part : ndarray of int8, shape (m,), or None
+        Which part of a quadratic facet each facet is, as in ``quadratic.Curved``; None if none is.
     """
     dim = points.shape[1]
     dx = np.asarray(lattice.dx, dtype=float)
@@ -142,12 +148,18 @@ def cut(points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0)
     pieces = find_pieces(x, facets, Box(frame.lo, shape, images, lo, hi), patches, inner, opening)
     some = np.flatnonzero(inner & np.any(patches.vectors != 0.0, axis=1))
     integrals = integrals[order[some]]
+    moments = integrals[:, dim:].reshape(-1, dim, dim)
+    integrals = integrals[:, :dim]
+    if part is not None:
+        place = np.column_stack(np.unravel_index(patches.cell[some], shape)) + frame.lo - images[patches.image[some]]
+        of = (frame, patches.facet[some], place)
+        integrals, moments = node_integrals(x, facets, part, *of, integrals, moments)
     return CutCells(
         facet=patches.facet[some],
         cell=cell[some],
         piece=pieces.patch_piece[some],
-        integrals=integrals[:, :dim],
-        moments=integrals[:, dim:].reshape(-1, dim, dim),
+        integrals=integrals,
+        moments=moments,
         normals=frame.normals,
         open=[_embedded(part, near_lo - lo, hi - lo + (np.arange(dim) == a), base) for a, part in enumerate(opening)],
         volume=_embedded(volume, near_lo - lo, hi - lo, base),

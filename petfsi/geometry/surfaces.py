@@ -8,6 +8,8 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from petfsi.geometry.quadratic import Curved
+
 #: The facets of a positively oriented simplex, each ordered so that its normal points out of it.
 _FACETS = {
     2: np.array([[0, 1], [1, 2], [2, 0]]),
@@ -34,6 +36,8 @@ class Surface:
         Columns of unknowns whose value is prescribed are empty here and stand in ``fixed_map``.
     fixed_map : scipy.sparse.csr_matrix, shape (n_points * dim, n_unknowns)
         The rest of the map: what prescribed unknowns contribute.
+    curved : Curved or None
+        How facets move if some are parts of quadratic ones; all others with the hat functions of their corners.
     """
 
     facets: np.ndarray
@@ -41,6 +45,16 @@ class Surface:
     void: np.ndarray
     point_map: csr_matrix
     fixed_map: csr_matrix
+    curved: Curved | None = None
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """The points whose shape functions each facet has, shape (n_facets, width)."""
+        return self.facets if self.curved is None else self.curved.nodes
+
+    def shape_functions(self, facet: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the functions of ``nodes`` where facets (n,) have the barycentric coordinates (n, dim)."""
+        return weights if self.curved is None else self.curved.values(facet, weights)
 
     @property
     def n_points(self) -> int:

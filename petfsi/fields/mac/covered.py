@@ -152,7 +152,7 @@ class CoveredGrid(FluidField):
             self.geometry_version += 1
             self._kinds_changed()
 
-    def cut(self, points: np.ndarray, facets: np.ndarray) -> tuple[Walls, Wet]:
+    def cut(self, points: np.ndarray, facets: np.ndarray, part: np.ndarray | None = None) -> tuple[Walls, Wet]:
         """Take over what a surface covers of cells and faces; return what it lets through, and bears. Collective.
 
         Parameters
@@ -161,9 +161,11 @@ class CoveredGrid(FluidField):
             The same on all ranks.
         facets : ndarray of int, shape (m, dim)
             Segments or triangles with normals into the fluid.
+        part : ndarray of int8, shape (m,), or None
+            As in ``quadratic.Curved``.
         """
         assert self._cutter is not None
-        found = self._cutter.cut(points, facets)
+        found = self._cutter.cut(points, facets, part)
         changed = any(
             not np.array_equal(new, old)
             for new, old in zip([found.cell_kind, *found.face_kind], [self.cell_kind, *self.face_kind], strict=True)

@@ -23,17 +23,17 @@ from petfsi.geometry.clipping import CutCells
 
 @dataclass(frozen=True)
 class Walls:
-    """What surfaces let through, by the corners of facets.
+    """What surfaces let through, by the nodes of facets.
 
-    The net outflow of unknown ``slot`` is ``flux[:, i]`` times the velocity along ``axis`` of the facet's corner i.
+    The net outflow of unknown ``slot`` is ``flux[:, i]`` times the velocity along ``axis`` of the facet's node i.
 
     Attributes
     ----------
     facet, axis : ndarray of int, shape (n,)
     slot : ndarray of int, shape (n,)
         A cell of the box, flat, or the number of its cells plus the number of an extra unknown.
-    flux : ndarray, shape (n, dim)
-        m^2 (m in 2D).
+    flux : ndarray, shape (n, width)
+        m^2 (m in 2D); of as many nodes as ``CutCells.integrals``.
     """
 
     facet: np.ndarray
@@ -49,7 +49,7 @@ class Wet:
     Attributes
     ----------
     facet : ndarray of int, shape (n,)
-    first : ndarray, shape (n, dim, dim, dim)
+    first : ndarray, shape (n, width, dim, dim)
         [patch, i, a, b]: the integral of N_i n_a (x_b - origin_b) dA, m^3 (m^2 in 2D).
     """
 

@@ -107,7 +107,7 @@ class CutGrid:
         view = array[part]
         return view if self.grid.dim == 3 else view[:, :, 0]
 
-    def cut(self, points: np.ndarray, facets: np.ndarray) -> Openings:
+    def cut(self, points: np.ndarray, facets: np.ndarray, part: np.ndarray | None = None) -> Openings:
         """Return the openings that obstacles and a surface leave. Collective.
 
         Parameters
@@ -115,10 +115,14 @@ class CutGrid:
         points : ndarray, shape (n, dim)
             The surface's points, the same on all ranks.
         facets : ndarray of int, shape (m, dim)
+        part : ndarray of int8, shape (m,), or None
+            As in ``quadratic.Curved``; None if no facet is part of a quadratic one.
         """
         grid = self.grid
         every = np.concatenate((points, self.points)), np.concatenate((facets, self.facets + len(points)))
-        found = cut(*every, self.lattice, self.base)
+        if part is not None:
+            part = np.concatenate((part, np.full(len(self.facets), -1, dtype=part.dtype)))
+        found = cut(*every, self.lattice, self.base, part)
         links = self._without_walls(links_of(found, self.shape))
         slot = patch_slots(found, len(self._flat))
         walls = walls_of(found, slot, len(facets))

@@ -13,7 +13,7 @@ from math import factorial
 
 import numpy as np
 
-from petfsi.geometry.quadratic import EDGES
+from petfsi.geometry.quadratic import shape_forms
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def quadratic_rule(dim: int, reduced: bool) -> Rule:
     if reduced:
         points = np.concatenate((points, np.full((1, dim + 1), 1 / (dim + 1))))
         weights, mu, lame = np.append(weights, 1.0), np.append(mu, 0.0), np.append(0 * lame, 1.0)
-    forms = _forms(dim)
+    forms = shape_forms(dim)
     # N_a = x . Q_a x, in a form whose gradients along the barycentric coordinates may differ by a constant from
     # those of another form: the coordinates' own gradients add up to zero
     table = 2 * np.einsum("aij,qj->qai", forms, points)
@@ -91,7 +91,7 @@ def shape_functions(barycentric: np.ndarray, nodes: int) -> np.ndarray:
     dim = barycentric.shape[-1] - 1
     if nodes == dim + 1:
         return barycentric
-    return np.einsum("...i,aij,...j->...a", barycentric, _forms(dim), barycentric)
+    return np.einsum("...i,aij,...j->...a", barycentric, shape_forms(dim), barycentric)
 
 
 def shape_slopes(barycentric: np.ndarray, nodes: int) -> np.ndarray:
@@ -100,20 +100,8 @@ def shape_slopes(barycentric: np.ndarray, nodes: int) -> np.ndarray:
     if nodes == dim + 1:
         gradients = np.broadcast_to(np.eye(dim + 1), (*barycentric.shape[:-1], dim + 1, dim + 1))
     else:
-        gradients = 2 * np.einsum("aij,...j->...ai", _forms(dim), barycentric)
+        gradients = 2 * np.einsum("aij,...j->...ai", shape_forms(dim), barycentric)
     return gradients[..., 1:] - gradients[..., :1]
-
-
-def _forms(dim: int) -> np.ndarray:
-    """Return the symmetric Q_a of N_a = x . Q_a x: corners x_a (x_a - the others), middles 4 x_a x_b."""
-    corners = dim + 1
-    forms = np.zeros((corners + len(EDGES[dim]), corners, corners))
-    for a in range(corners):
-        forms[a, a, :] = forms[a, :, a] = -0.5
-        forms[a, a, a] = 1.0
-    for n, (a, b) in enumerate(EDGES[dim]):
-        forms[corners + n, a, b] = forms[corners + n, b, a] = 2.0
-    return forms
 
 
 def _fourth_moments(dim: int) -> np.ndarray:

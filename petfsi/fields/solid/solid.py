@@ -19,7 +19,7 @@ from petfsi.fields.solid.patches import grid_patches, grouped_mesh, grown_patche
 from petfsi.fields.solid.probes import Place, locate
 from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.meshes import SimplexMesh
-from petfsi.geometry.quadratic import with_middles
+from petfsi.geometry.quadratic import Curved, beyond_middles, facet_parts, facets_with_middles, with_middles
 from petfsi.geometry.surfaces import Surface, boundary_facets, shells, signed_volumes
 from petfsi.petsc import IntType
 from petfsi.ranks import on_root
@@ -65,12 +65,14 @@ class SimplexSolid(NodalSolid):
 
     def _make_surface(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Surface:
         number, node_body = self._number, self._node_body
-        facets = boundary_facets(mesh.points, mesh.cells)
+        facets, curved = _boundary(mesh)
         shell, volume = shells(mesh.points, facets)
         cavity = volume[shell] < 0
         hollow = np.array([solid.interior == "void" for solid in solids.values()])
         nodes, facets = np.unique(facets, return_inverse=True)
         facets = facets.reshape(-1, self.dim)
+        if curved is not None:
+            curved = curved._replace(nodes=np.searchsorted(nodes, curved.nodes))
         unknowns = (self.dim * number[nodes].astype(np.int64)[:, None] + np.arange(self.dim)).ravel()
         fixed = np.isin(unknowns, self._supports.unknowns)
         # the surface's points are gathered rank after rank; this is where each belongs
@@ -84,6 +86,7 @@ class SimplexSolid(NodalSolid):
             void=cavity & hollow[node_body[nodes[facets[:, 0]]]],
             point_map=_selection(unknowns, ~fixed, self.layout.n_global),
             fixed_map=_selection(unknowns, fixed, self.layout.n_global),
+            curved=curved,
         )
 
     def light_motions(self, degree: int, density: float, most: int) -> np.ndarray:
@@ -126,11 +129,16 @@ class SimplexSolid(NodalSolid):
         From ``predict`` to ``accept`` those where the step's tangent is taken, otherwise the present ones.
         """
         displacement = self.displacement if self._geometry is None else self._geometry
-        return self._gather_surface(self.reference[self._wet] + displacement[self._wet])
+        return self._vertices(self.reference[self._wet] + displacement[self._wet])
 
     def surface_velocity(self) -> np.ndarray:
         """Return w of the step last accepted at the surface's points, shape (n_points, dim). Collective."""
         return self._gather_surface(self._integrator.solved(self._motion())[self._wet])
+
+    def _vertices(self, wet: np.ndarray) -> np.ndarray:
+        """Return where the surface's points are if this rank's nodes on it are at ``wet``. Collective."""
+        nodes = self._gather_surface(wet)
+        return nodes if self._surface.curved is None else self._surface.curved.vertices(nodes)
 
     def _gather_surface(self, wet: np.ndarray) -> np.ndarray:
         gathered = np.empty((self._surface.n_points, self.dim))
@@ -170,7 +178,11 @@ class SimplexSolid(NodalSolid):
     def volumes(self) -> dict[str, float]:
         """Return the volume that each body's surface encloses, m^3 (m^2 in 2D). Collective."""
         mesh = self._mesh
-        present = signed_volumes(mesh.points + self._with_shared(self.displacement), mesh.cells)
+        x = mesh.points + self._with_shared(self.displacement)
+        for group in mesh.groups:
+            if group.gradients is None and group.nodes.shape[1] > self.dim + 1:
+                x = beyond_middles(x, group.nodes, self.dim)
+        present = signed_volumes(x, mesh.cells)
         own = np.where(mesh.counted_cells, present, 0.0)
         total = np.empty(len(self.names))
         self.comm.Allreduce(np.bincount(mesh.body, weights=own, minlength=len(self.names)), total)
@@ -211,6 +223,17 @@ def _union(scene: Scene) -> SimplexMesh:
             patch = (grid_patches if solid.shape.box is not None else grown_patches)(cells, scene.dim)
         bodies.append((points, cells, patch))
     return grouped_mesh(bodies)
+
+
+def _boundary(mesh: SimplexMesh) -> tuple[np.ndarray, Curved | None]:
+    """Return the facets of all bodies, by nodes of the mesh, and how those of quadratic ones move."""
+    dim = mesh.points.shape[1]
+    bodies = []
+    for body in range(int(mesh.body.max()) + 1):
+        elements = mesh.elements(body)
+        facets = boundary_facets(mesh.points, elements[:, : dim + 1])
+        bodies.append(facet_parts(facets_with_middles(facets, elements), dim))
+    return np.concatenate([facets for facets, _ in bodies]), Curved.joined(bodies)
 
 
 def _bodies(solids: Mapping[str, Solid]) -> Bodies:
