@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from numba import njit
 from petsc4py import PETSc
+from scipy.sparse import coo_matrix
 
 from petfsi.errors import InputError
 from petfsi.ranks import on_root
@@ -155,16 +156,11 @@ def gather_triplets(
             comm.Alltoallv([send, counts], [recv, received])
             parts.append(recv)
         i, j, values = parts
-    local = np.asarray(i, dtype=np.int64) - rows.start
-    order = np.lexsort((j, local))
-    local, j, values = local[order], np.asarray(j)[order], np.asarray(values, dtype=float)[order]
-    if len(local):
-        first = np.flatnonzero(np.concatenate(([True], (np.diff(local) != 0) | (np.diff(j) != 0))))
-        values = np.add.reduceat(values, first)
-        local, j = local[first], j[first]
-    indptr = np.zeros(rows.n_local + 1, dtype=IntType)
-    np.cumsum(np.bincount(local, minlength=rows.n_local), out=indptr[1:])
-    return indptr, j.astype(IntType), values
+    local, j = np.asarray(i, dtype=np.int64) - rows.start, np.asarray(j, dtype=np.int64)
+    entries = np.asarray(values, dtype=float), (local, j)
+    found = coo_matrix(entries, shape=(rows.n_local, int(j.max(initial=-1)) + 1)).tocsr()  # adds up by place
+    found.sort_indices()
+    return found.indptr.astype(IntType), found.indices.astype(IntType), found.data
 
 
 def sum_csr(

@@ -284,7 +284,7 @@ class MacFluid(CoveredGrid):
         stock = budget.stock(self.grid, self.density, velocity, self.face_kind, self.openness, self.extras)
         if self.slivers is None:
             return stock
-        flow = self._outflow(velocity)[self.slivers.slot]
+        flow = self._outflow_of(self.slivers.slot, velocity)
         pushed = self.density * self.slivers.size * flow
         kinetic = 0.5 * float(pushed @ flow)
         return Stock(stock.momentum + pushed @ self.slivers.normal, stock.kinetic + kinetic)
@@ -301,6 +301,22 @@ class MacFluid(CoveredGrid):
         if self.extras is not None:
             self.extras.add_inflow(velocity, areas, self.layout, inflow)
         return -inflow
+
+    def _outflow_of(self, unknowns: np.ndarray, velocity: list[np.ndarray]) -> np.ndarray:
+        """Return the same for some unknowns, by their local numbers."""
+        inflow = np.zeros(self.layout.n_local)
+        areas = np.array([self.grid.face_area(axis) for axis in self._axes])
+        cells = unknowns[unknowns < self.n_cells]
+        through = np.zeros(len(cells))
+        for axis in self._axes:
+            pressure.known_inflow_of(
+                cells, velocity[axis], self.boundary_velocity[axis], self.face_kind[axis], self.openness[axis],
+                kinds.STEP[axis], areas[axis], self._part(None), through,
+            )  # fmt: skip
+        inflow[cells] = through
+        if self.extras is not None:
+            self.extras.add_inflow(velocity, areas, self.layout, inflow)
+        return -inflow[unknowns]
 
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted, see ``budget``."""
