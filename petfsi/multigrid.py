@@ -26,6 +26,7 @@ from petsc4py import PETSc
 from petfsi import petsc
 from petfsi.errors import InputError
 from petfsi.petsc import IntType, Layout
+from petfsi.resisted import Resisted
 from petfsi.smoothers import Walls
 
 if TYPE_CHECKING:
@@ -238,7 +239,14 @@ class Multigrid:
         for n, transfer in enumerate(self.transfers):
             pc.setMGInterpolation(levels - 1 - n, transfer.linear)
 
-    def refresh(self, block: PETSc.Mat, fluxes: PETSc.Mat, walls: PETSc.Mat | None, pattern_version: int) -> None:
+    def refresh(
+        self,
+        block: PETSc.Mat,
+        fluxes: PETSc.Mat,
+        walls: PETSc.Mat | None,
+        resisted: Resisted | None,
+        pattern_version: int,
+    ) -> None:
         """Make the coarse operators, in place if the pattern of L is that of the last call. Collective.
 
         Parameters
@@ -249,6 +257,8 @@ class Multigrid:
             L; may be the same.
         walls : PETSc.Mat or None
             E.
+        resisted : Resisted or None
+            L + E of the finest level where it is no matrix.
         pattern_version : int
             Of L's pattern.
         """
@@ -261,7 +271,7 @@ class Multigrid:
             return
         first = not self._fluxes
         levels = len(self.transfers) + 1
-        finest = block if walls is None else self._fine
+        finest = block if walls is None else self._fine if resisted is None else resisted.operator()
         operators, parts = [], [(block, walls)]
         for n, transfer in enumerate(self.transfers):
             carry = transfer.constant if transfer.regular else transfer.linear
@@ -284,10 +294,21 @@ class Multigrid:
             if level:
                 petsc.set_mg_residual(self._pc, level, operator)
         for n, part in enumerate(parts[: levels - 1]):
-            self._tell(levels - 1 - n, part)
+            self._tell(levels - 1 - n, part, None if n else resisted)
         self._operators, self._read = operators, True
 
-    def _tell(self, level: int, parts: tuple[PETSc.Mat | None, PETSc.Mat | None]) -> None:
+    def can_resist(self) -> bool:
+        """Return whether the finest level does with an operator that is no matrix. Collective."""
+        if self._galerkin or not self.transfers:
+            return False
+        solver = self._pc.getMGSmoother(len(self.transfers))
+        if not self._read:
+            solver.setFromOptions()
+        return solver.getPC().getType() == PETSc.PC.Type.PYTHON
+
+    def _tell(
+        self, level: int, parts: tuple[PETSc.Mat | None, PETSc.Mat | None], resisted: Resisted | None = None
+    ) -> None:
         """Give the smoother of a level the two parts of its operator, if it cares."""
         solver = self._pc.getMGSmoother(level)
         if not self._read:
@@ -297,7 +318,7 @@ class Multigrid:
             # not by the option pc_python_type: such a context outlives Python and crashes PETSc's end
             if pc.getPythonContext() is None:
                 pc.setPythonContext(Walls())
-            pc.getPythonContext().parts = parts
+            pc.getPythonContext().parts, pc.getPythonContext().resisted = parts, resisted
 
 
 def _carried(fine: PETSc.Mat, transfer: PETSc.Mat, result: PETSc.Mat | None) -> PETSc.Mat:

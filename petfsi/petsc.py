@@ -128,6 +128,22 @@ def set_mg_residual(pc: PETSc.PC, level: int, operator: PETSc.Mat) -> None:
         raise PETSc.Error
 
 
+def factorised(mat: PETSc.Mat, prefix: str) -> PETSc.KSP:
+    """Return a solver for a symmetric matrix: redundant Cholesky, unless options tell otherwise. Collective."""
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(mat)
+    ksp.setType(PETSc.KSP.Type.PREONLY)
+    ksp.getPC().setType(PETSc.PC.Type.REDUNDANT)
+    inner = PETSc.Options(f"{prefix}redundant_")
+    for name, value in (("pc_type", "cholesky"), ("pc_factor_mat_solver_type", "mumps")):
+        if not inner.hasName(name):
+            inner.setValue(name, value)
+    ksp.setFromOptions()
+    ksp.setUp()
+    return ksp
+
+
 def gather_triplets(
     comm: MPI.Comm, rows: Layout, i: np.ndarray, j: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

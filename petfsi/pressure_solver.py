@@ -10,7 +10,9 @@ from petfsi.errors import InputError
 from petfsi.fields.base import FluidField, SolidField
 from petfsi.modes import DEGREE, LIGHT, LINEAR, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
+from petfsi.resisted import Resisted
 from petfsi.schur import FAINT, SchurStandIn
+from petfsi.smoothers import DOMINANT
 from petfsi.system import System
 
 #: A preconditioner is kept while no diagonal entry has changed by more than this part, and the iterations have not
@@ -39,6 +41,7 @@ class PressureSolver:
         self.system, self.fluid = system, fluid
         self.stand_in: SchurStandIn | None = None
         self._multigrid: Multigrid | None = None
+        self._resisted: Resisted | None = None
         self._ksp: PETSc.KSP | None = None
         self._has_modes = False
         self._built: np.ndarray | None = None
@@ -61,7 +64,8 @@ class PressureSolver:
             The fluid's grids, if it has any.
         """
         self._ksp = ksp
-        self._read(PETSc.Options(ksp.getOptionsPrefix()))
+        self._prefix = ksp.getOptionsPrefix()
+        self._read(PETSc.Options(self._prefix))
         pc = ksp.getPC()
         if pc.getType() == PETSc.PC.Type.MG:
             if hierarchy is None:
@@ -78,6 +82,7 @@ class PressureSolver:
         self._degree, self._light = own.getInt("modes_degree", DEGREE), own.getReal("modes_below", LIGHT)
         self._rigid = own.getReal("modes_linear_below", LINEAR)
         self._aims = not own.hasName("ksp_atol")
+        self._dominant = own.getReal("mg_levels_walls_from", DOMINANT)
         own.getReal("schur_faint", FAINT)
 
     def _add_modes(self, ksp: PETSc.KSP) -> None:
@@ -146,16 +151,27 @@ class PressureSolver:
 
     def _pass_on(self, stale: bool = True) -> None:
         if stale and self._multigrid is not None:
-            walls = self.stand_in.walls if self.stand_in is not None and self.stand_in.matter else None
-            self._multigrid.refresh(self.fluid.block, self.fluid.fluxes, walls, self.fluid.pattern_version)
+            self._remake(self._multigrid)
         if self.eliminates and self._ksp is not None:
             schur = self._ksp.getOperators()[0]
             schur.setNullSpace(self.fluid.block.getNullSpace())
             schur.setTransposeNullSpace(self.fluid.block.getNullSpace())
 
+    def _remake(self, multigrid: Multigrid) -> None:
+        """Give multigrid the present operators. Collective."""
+        fluid, walls = self.fluid, None
+        last, self._resisted = self._resisted, None
+        if self.stand_in is not None and self.stand_in.matter:
+            walls = self.stand_in.walls
+            if multigrid.can_resist():
+                self._resisted = self.stand_in.resisted(self._dominant, f"{self._prefix}mg_levels_walls_")
+        multigrid.refresh(fluid.block, fluid.fluxes, walls, self._resisted, fluid.pattern_version)
+        if last is not None:
+            last.release()
+
     def release(self) -> None:
         """Hold on to no solver any longer."""
-        self._ksp = self._multigrid = None
+        self._ksp = self._multigrid = self._resisted = None
 
     def aim(self, residual: float) -> None:
         """Let the inner solver stop where the whole has the wanted residual, unless options say where."""

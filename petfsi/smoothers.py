@@ -13,6 +13,7 @@ then smooths nothing. There the rows that walls touch are solved together, the o
 
 No eigenvalue of M^-1 (L + E) exceeds 2 either. Those of what E alone resists are all 1: damped to a root of
 Chebyshev's polynomial, they are not reduced but gone, which a coarse grid that knows little of E needs.
+Where E is no matrix (see ``resisted``), the block has unknowns of its own, and is solved in any case.
 
     -..._mg_levels_walls_from 10      largest E_ii / L_ii from which on the block is solved; 0 is always
     -..._mg_levels_walls_damping .634 of the block; the lower root for two iterations between 0.4 and 2
@@ -25,7 +26,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi.petsc import row_sums
+from petfsi.petsc import factorised, row_sums
+from petfsi.resisted import Resisted
 
 #: Largest E_ii / L_ii up to which the diagonal is good enough.
 DOMINANT = 10.0
@@ -40,10 +42,13 @@ class Walls:
     ----------
     parts : (PETSc.Mat or None, PETSc.Mat or None)
         L and E of the operator; set before ``setUp``. Without them the operator is L.
+    resisted : Resisted or None
+        What the operator is where E is not a matrix; set before ``setUp``, too.
     """
 
     def __init__(self) -> None:
         self.parts: tuple[PETSc.Mat | None, PETSc.Mat | None] = None, None
+        self.resisted: Resisted | None = None
         self._inverse: PETSc.Vec | None = None
         self._ksp: PETSc.KSP | None = None
 
@@ -56,7 +61,7 @@ class Walls:
         fluxes, walls = self.parts
         diagonal = _bound(fluxes if fluxes is not None else pc.getOperators()[1])
         if walls is not None:
-            if fluxes is not None and self._dominates(fluxes, walls):
+            if fluxes is not None and (self.resisted is not None or self._dominates(fluxes, walls)):
                 self._solve_together(fluxes, walls)
             else:
                 diagonal.axpy(1.0, _bound(walls))
@@ -71,20 +76,12 @@ class Walls:
         self._rows = np.flatnonzero(walls.getDiagonal().array)
         numbers = walls.getOwnershipRange()[0] + self._rows
         chosen = PETSc.IS().createGeneral(numbers.astype(PETSc.IntType), comm=walls.comm)
-        block = fluxes.createSubMatrix(chosen, chosen)
-        block.axpy(1.0, walls.createSubMatrix(chosen, chosen), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        ksp = PETSc.KSP().create(walls.comm)
-        ksp.setOptionsPrefix(self._prefix)
-        ksp.setOperators(block)
-        ksp.setType(PETSc.KSP.Type.PREONLY)
-        ksp.getPC().setType(PETSc.PC.Type.REDUNDANT)
-        inner = PETSc.Options(f"{self._prefix}redundant_")
-        for name, value in (("pc_type", "cholesky"), ("pc_factor_mat_solver_type", "mumps")):
-            if not inner.hasName(name):
-                inner.setValue(name, value)
-        ksp.setFromOptions()
-        ksp.setUp()
-        self._ksp, (self._x, self._b) = ksp, block.createVecs()
+        if self.resisted is not None:
+            block = self.resisted.block(chosen)
+        else:
+            block = fluxes.createSubMatrix(chosen, chosen)
+            block.axpy(1.0, walls.createSubMatrix(chosen, chosen), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self._ksp, (self._x, self._b) = factorised(block, self._prefix), block.createVecs()
 
     def _drop(self) -> None:
         for thing in (self._ksp, self._inverse):
@@ -96,9 +93,10 @@ class Walls:
         """Write M^-1 x into y. Collective."""
         y.pointwiseMult(x, self._inverse)
         if self._ksp is not None:
-            self._b.array[:] = x.array_r[self._rows]
+            n = len(self._rows)
+            self._b.array[:n] = x.array_r[self._rows]  # beyond, if anything, lies 0
             self._ksp.solve(self._b, self._x)
-            y.array[self._rows] = self._damping * self._x.array_r
+            y.array[self._rows] = self._damping * self._x.array_r[:n]
 
 
 def _bound(mat: PETSc.Mat) -> PETSc.Vec:

@@ -25,6 +25,8 @@ class Coupling(ABC):
     pushed : ndarray or None
         T, by this rank's unknowns of the fluid, where the coupling adds J T J^T to the solid's block, kg/(m^4 s)
         (kg/(m^3 s) in 2D).
+    push : (ndarray, ndarray, ndarray) or None
+        T^(1/2) J^T of those with T > 0, one row each in their order.
     symmetric : bool
         Whether D1 H = J^T, so that iterations for symmetric systems may be used.
     n_coupled, n_assembled : int
@@ -34,6 +36,7 @@ class Coupling(ABC):
     blocks: dict[tuple[str, str], PETSc.Mat]
     touched: np.ndarray | None = None
     pushed: np.ndarray | None = None
+    push: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     symmetric: bool = False
     pattern_version: int = 0
     n_coupled: int = 0

@@ -95,12 +95,16 @@ class CutCellCoupling(Coupling):
     def _sliver_mass(self, factor: float) -> Rows | None:
         """Return J T J^T over the slivers with S > 0, this rank's rows of the solid. Collective."""
         slivers = self.fluid.slivers
-        self.pushed = None
+        self.pushed = self.push = None
         if slivers is None or not self.comm.allreduce(bool(np.any(slivers.size > 0.0)), op=MPI.LOR):
             return None
         self.pushed = np.zeros(self.fluid.layout.n_local)
         self.pushed[slivers.slot] = self.fluid.density / factor * np.maximum(slivers.size, 0.0)
         thick = np.flatnonzero(self.pushed)
+        indptr, indices, values = self._flux
+        rows = csr_matrix((values, indices, indptr), shape=(len(self.pushed), self.solid.layout.n_global))[thick]
+        rows.data *= np.repeat(np.sqrt(self.pushed[thick]), np.diff(rows.indptr))
+        self.push = rows.indptr, rows.indices, rows.data
         entries = outer_products(*self._flux, *self._flux, thick, self.pushed[thick])
         return gather_triplets(self.comm, self.solid.layout, *entries)
 
