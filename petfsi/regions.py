@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.fields.base import FluidField, Reader, Slab
+from petfsi.following import Marks, follow
 from petfsi.system import System
 
 
@@ -40,16 +41,16 @@ class ClosedRegions:
         self._members: list[np.ndarray] = []
         self._volumes = np.zeros(0)
         self.volumes = np.zeros(0)
-        self._number: np.ndarray | None = None
+        self._marks: Marks | None = None
         self._found_for: tuple[int, ...] | None = None
         self._before = self._tracked()
 
-    def _tracked(self) -> tuple[np.ndarray | None, np.ndarray]:
-        return self._number, self.volumes
+    def _tracked(self) -> tuple[Marks | None, np.ndarray]:
+        return self._marks, self.volumes
 
     def rewind(self) -> None:
         """Go back to the regions of before the last ``refresh`` that found any changed."""
-        (self._number, self.volumes), self._found_for = self._before, None
+        (self._marks, self.volumes), self._found_for = self._before, None
 
     def adopt(self, system: System) -> None:
         """Speak to another system of the same fields from now on."""
@@ -67,11 +68,12 @@ class ClosedRegions:
         self._members = [member for member, _ in regions]
         volumes = fluid.volumes()
         sizes = np.array([member @ volumes for member in self._members])
-        if self._number is None:
-            self._volumes = self.volumes = system.comm.allreduce(sizes)
-            self._number = self._present()
+        self._volumes = system.comm.allreduce(sizes)
+        marks = Marks.of(system.comm, self._members, fluid.n_cells, fluid.bounds)
+        if self._marks is None:
+            self._marks, self.volumes = marks, self._volumes
         else:
-            self._follow(sizes)
+            self._follow(self._marks, marks)
         rigid = [member for member, touches_solid in regions if not touches_solid]
         _attach(fluid.block, self._members if self.decoupled else rigid)
         if system.index_sets:
@@ -80,44 +82,34 @@ class ClosedRegions:
                 row[system.piece(fluid.name)] = member
             _attach(system.operator, list(whole))
 
-    def _present(self) -> np.ndarray:
-        """Return which of the present regions each lasting unknown lies in, counted from 1; 0 is none."""
-        here = np.zeros(self.fluid.n_cells)
-        for number, member in enumerate(self._members, start=1):
-            here += number * member[: self.fluid.n_cells]
-        return here
-
-    def _follow(self, sizes: np.ndarray) -> None:
-        """Find which of the first regions the present ones are: those that share cells with each other alone.
-
-        Parameters
-        ----------
-        sizes : ndarray
-            This rank's part of the present volumes. Collective: one reduction.
-        """
-        assert self._number is not None
-        present, n_old, n_new = self._present(), len(self.volumes), len(sizes)
-        pairs = (self._number * (n_new + 1) + present).astype(np.int64)
-        shared = np.bincount(pairs, minlength=(n_old + 1) * (n_new + 1))
-        total = self.system.comm.allreduce(np.concatenate((sizes, shared)))
-        self._volumes = total[:n_new]
-        meets = total[n_new:].reshape(n_old + 1, n_new + 1)[1:, 1:] > 0
-        same = meets & (meets.sum(axis=0) == 1) & (meets.sum(axis=1) == 1)[:, None]
-        old, new = np.nonzero(same)
+    def _follow(self, before: Marks, now: Marks) -> None:
+        """Find which of the first regions the present ones are. Collective."""
+        n_old, n_new = len(self.volumes), len(self._volumes)
+        old, new = follow(self.system.comm, before, now, n_old, n_new)
         self.volumes = np.full(n_old, np.nan)
         self.volumes[old] = self._volumes[new]
-        renumbered = np.zeros(n_new + 1)
-        renumbered[new + 1] = old + 1
-        self._number = renumbered[present.astype(np.int64)]
+        numbers = np.zeros(n_new + 1, dtype=np.int64)
+        numbers[new + 1] = old + 1
+        self._marks = now.renumbered(numbers)
 
     def state(self) -> dict[str, Slab]:
         """Return where the first regions are now."""
-        assert self._number is not None
-        return {"region": self.fluid.cells_slab(self._number)}
+        marks = self._marks
+        assert marks is not None
+        arrays = {"region": self.fluid.cells_slab(marks.cells.astype(float))}
+        n, first = len(marks.facets), self.system.comm.rank == 0
+        if n:
+            arrays["region_facet"] = Slab(marks.facets[: n * first].astype(float), (0 if first else n,), (n,))
+        return arrays
 
     def restore(self, read: Reader) -> None:
         """Take up a state. Collective."""
-        self._number, self._found_for = self.fluid.read_cells(read, "region"), None
+        assert self._marks is not None
+        cells = self.fluid.read_cells(read, "region").astype(np.int64)
+        facets = self._marks.facets
+        if len(facets):
+            facets = read("region_facet", (0,), facets.shape).astype(np.int64)
+        self._marks, self._found_for = Marks(cells, facets), None
 
     def volume_error(self, dt: float) -> float:
         """Return the largest relative change of a region's volume in the last step, |sum of net outflows| dt / V.

@@ -217,7 +217,7 @@ def test_what_flows_through_leaves_no_trace():
 class Cells:
     """Stands in for a fluid of four cells."""
 
-    n_cells = 4
+    n_cells, bounds = 4, None
 
     def __init__(self, *members):
         self.members, self.geometry_version = members, 0

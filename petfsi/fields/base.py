@@ -204,6 +204,9 @@ class FluidField(Field):
     fluxes : PETSc.Mat
         What the block consists of for the most part, with a pattern that seldom changes: what preconditioners are made
         of. May be the block itself. ``pattern_version`` is its.
+    bounds : tuple of (ndarray, ndarray, int), or None
+        Facets of a surface and the local unknowns that they bound, pair by pair, and how many facets there are; None
+        where this is not known.
     """
 
     comm: MPI.Comm
@@ -211,6 +214,7 @@ class FluidField(Field):
     cell_volume: float
     n_cells: int
     fluxes: PETSc.Mat
+    bounds: tuple[np.ndarray, np.ndarray, int] | None = None
     geometry_version: int = 0
 
     @property

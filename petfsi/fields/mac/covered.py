@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
     "cell_kind", "face_kind", "openness", "narrow", "volume", "slivers", "extras", "index", "layout",
-    "block", "fluxes", "rhs",
+    "block", "fluxes", "rhs", "bounds",
 )  # fmt: skip
 
 
@@ -183,6 +183,7 @@ class CoveredGrid(FluidField):
             self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.slivers = found.slivers if self._moves else None
+        self.bounds = found.walls.facet, found.walls.slot - self.layout.start, len(facets)
         self.geometry_version += 1
         return found.walls, found.wet
 

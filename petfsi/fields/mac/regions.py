@@ -15,6 +15,9 @@ from petfsi.fields.mac.kinds import OPEN, PRESSURE
 from petfsi.geometry.union_find import find, join
 from petfsi.petsc import Layout
 
+#: More pieces than a cell can have.
+MOST_PIECES = 1 << 20
+
 
 @njit(cache=True)
 def _label(active, kind0, kind1, kind2, part, flat, labels):
@@ -58,7 +61,7 @@ class Regions:
     ----------
     members : list of ndarray
         Per region 1 for its unknowns on this rank and 0 for the others. Regions are in the order of their first cells
-        in the global grid, on any number of ranks.
+        in the global grid, and of their pieces there, on any number of ranks.
     """
 
     grid: MacGrid
@@ -88,13 +91,14 @@ def find_regions(
     kind_x, kind_y, kind_z = three(face_kind)
     first = _label(active, kind_x, kind_y, kind_z, part, grid.dim == 2, labels)
     place = np.unravel_index(first, grid.owned_shape)
-    natural = np.ravel_multi_index([p + m for p, m in zip(place, grid.lo, strict=True)], grid.cells)
+    natural = MOST_PIECES * np.ravel_multi_index([p + m for p, m in zip(place, grid.lo, strict=True)], grid.cells)
     n_extra = 0 if extras is None else len(extras.cell)
     n_labels = len(first) + n_extra
     if extras is not None:
-        # an extra unknown counts from the start as a region of its own, which comes after its cell
+        # an extra unknown counts from the start as a region of its own, which comes after its cell and those before
         cell = np.array(np.unravel_index(extras.cell, grid.shape(None))) - np.array(grid.ghost)[:, None]
-        natural = np.concatenate((natural, np.ravel_multi_index(cell + np.array(grid.lo)[:, None], grid.cells)))
+        begins = MOST_PIECES * np.ravel_multi_index(cell + np.array(grid.lo)[:, None], grid.cells) + extras.piece
+        natural = np.concatenate((natural, begins))
     counts = comm.allgather(n_labels)
     offset = sum(counts[: comm.rank])
     labels[labels >= 0] += offset
