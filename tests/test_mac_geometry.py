@@ -114,7 +114,7 @@ def test_the_band_does_not_depend_on_the_ranks(cells):
 @pytest.mark.parallel([1, 2, 3, 4])
 @pytest.mark.parametrize("door", [False, True])
 def test_closed_regions_are_found_across_ranks(door):
-    wall = {"shape": {"box": {"origin": [0.47, -1.0], "size": [0.06, 1.7 if door else 3.0]}}}
+    wall = {"shape": {"box": {"origin": [0.47, 0.0], "size": [0.06, 0.7 if door else 1.0]}}}
     fluid = make_fluid((30, 24), sides={"bottom": "periodic", "top": "periodic"}, obstacles={"wall": wall})
     # a sheet with fluid within: a third room
     x, y, _ = fluid.grid.coordinates(0)

@@ -12,6 +12,7 @@ from petfsi.geometry import obstacles
 from petfsi.geometry.bodies import enclosed
 from petfsi.geometry.clipping import Lattice, cut
 from petfsi.geometry.obstacles import obstacle_surface, obstacle_surfaces
+from petfsi.geometry.seams import find_seams
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import occurrences, ridges, shells
 from petfsi.scene.load import scene_from_dict
@@ -148,21 +149,25 @@ def test_a_half_space_below_the_grid_is_a_slab_below_it():
 )
 def test_what_reaches_through_a_periodic_grid_has_no_ends_there(shape):
     points, facets = surface(shape, periodic=[True, False, True])
-    assert len(facets) == 4
+    assert_closed(facets)
+    seams = find_seams(points, facets, np.ones(3), np.array([True, False, True]))
+    walls = facets[seams.walls]
+    assert len(walls) == 4 and [len(cap) for cap in seams.caps] == [2, 0, 2]
     assert np.array_equal(np.unique(points[:, 0]), [0, 1]) and np.array_equal(np.unique(points[:, 2]), [0, 1])
     assert points[:, 1].max() == pytest.approx(0.2)
-    a, b, c = points[facets].transpose(1, 0, 2)
+    a, b, c = points[walls].transpose(1, 0, 2)
     area = 0.5 * np.cross(b - a, c - a)
     assert area[:, [0, 2]] == pytest.approx(0.0)
     assert sorted(area[:, 1]) == pytest.approx([-0.5, -0.5, 0.5, 0.5])
     # with ends only along x it is a tunnel
     points, facets = surface(shape, periodic=[False, False, True])
-    assert len(facets) == 8 and np.array_equal(np.unique(points[:, 2]), [0, 1])
+    seams = find_seams(points, facets, np.ones(3), np.array([False, False, True]))
+    assert len(seams.walls) == 8 and np.array_equal(np.unique(points[:, 2]), [0, 1])
 
 
 def test_a_leaning_floor_repeats_along_the_axis_it_does_not_lean_to():
     points, facets = surface({"halfspace": {"point": [0, 0.5, 0], "normal": [0.6, 0.8, 0.0]}}, periodic=[0, 0, 1])
-    assert len(facets) == 8
+    assert len(find_seams(points, facets, np.ones(3), np.array([False, False, True])).walls) == 8
     assert np.array_equal(np.unique(points[:, 2]), [0.0, 1.0])
     assert np.linalg.det(points[facets] - [0.5, 0.5, 0.5]).sum() != 0
 
@@ -216,8 +221,8 @@ def test_a_scene_without_obstacles_has_no_surface():
 
 def test_a_floor_of_a_periodic_scene_has_no_ends():
     every = obstacle_surfaces(scene({"floor": FLOOR}, left="periodic", right="periodic"))
-    assert len(every.facets) == 2 and np.array_equal(np.unique(every.points[:, 0]), [0.0, 2.0])
-    assert len(obstacle_surfaces(scene({"floor": FLOOR})).facets) == 4
+    assert len(every.seams.walls) == 2 and np.array_equal(np.unique(every.points[:, 0]), [0.0, 2.0])
+    assert len(obstacle_surfaces(scene({"floor": FLOOR})).seams.walls) == 4
 
 
 def test_shapes_that_need_too_many_facets_and_unfit_files_are_named(tmp_path, monkeypatch):
@@ -262,8 +267,11 @@ def test_the_grid_finds_the_room_that_obstacles_leave(obstacles, room, sides):
     cells = np.array([10, 12, 14])
     periodic = np.array(["left" in sides, False, False])
     lattice = Lattice(np.zeros(3), 1 / cells, cells, periodic, np.zeros(3, dtype=int), cells)
-    got = cut(every.points, every.facets, lattice, every.base)
+    got = cut(every.points, every.facets, lattice, every.base, None, every.seams)
     assert got.volume.mean() == pytest.approx(room, rel=2e-8)
+    if sides:  # what reaches around the axis covers its rows, too
+        assert np.ptp(got.open[0], axis=0).max() < 1e-14
+        assert got.open[0][0].mean() == pytest.approx(room, rel=2e-8)
     # every cell is closed: its open faces and its walls
     wall = np.zeros((cells.prod(), 3))
     np.add.at(wall, got.cell, got.integrals.sum(axis=1)[:, None] * got.normals[got.facet])

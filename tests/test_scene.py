@@ -463,7 +463,12 @@ def test_a_half_space_may_stand_beside_periodic_sides():
         (balloon("solids.shell.shape.box.cells=[6, 6]"), "solids.shell.shape.box.cells", "must have 3 items"),
         (balloon("solids.shell.shape.cavity.cells=[1, 1, 1]"), "cavity.cells", "leave cells out"),
         (balloon("fluid.sides.front=open"), "fluid.sides.back", "the opposite side 'front'"),
-        (balloon("solids.shell.shape.box.origin.2=0.5"), "z from 0.5 to 1.1 m", "z must lie inside"),
+        (balloon("solids.shell.shape.box.origin.1=0.5"), "y from 0.5 to 1.1 m", "y must lie inside"),
+        (
+            balloon("solids.shell.shape.box.size.2=1.1"),
+            "solids.shell.shape.box = ",
+            "z must be no longer than the grid",
+        ),
         (balloon("solids.fluid={}"), "solids.fluid.shape", "is missing"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -12,6 +12,7 @@ from petfsi.couplings.base import Coupling
 from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
+from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_triplets, row_sums, sum_csr
 from petfsi.scene import schema
@@ -36,6 +37,7 @@ class CutCellCoupling(Coupling):
         self.comm: MPI.Comm = fluid.comm
         self.dim = fluid.dim
         self._take(solid.surface())
+        self._seams: Seams | None = None
         self._new_blocks()
         self._positions: np.ndarray | None = None
         self._stale, self._dt, self._factor = False, 0.0, 0.0
@@ -77,9 +79,14 @@ class CutCellCoupling(Coupling):
 
     def _cut(self, positions: np.ndarray) -> None:
         """Cut the grid and make what walls let through. Collective."""
-        walls, wet = self.fluid.cut(positions, self.facets, None if self.curved is None else self.curved.part)
+        if self._seams is None:
+            # as all is at rest: what meets there is one
+            self._seams = self.fluid.find_seams(positions, self.facets)
+        part = None if self.curved is None else self.curved.part
+        walls, wet = self.fluid.cut(positions, self.facets, part, self._seams)
+        self._walls = self.nodes[self._seams.walls]
         layout = self.fluid.layout
-        points = self.nodes[walls.facet] * self.dim + walls.axis[:, None]
+        points = self._walls[walls.facet] * self.dim + walls.axis[:, None]
         rows = np.repeat(walls.slot - layout.start, self.nodes.shape[1])
         shape = (layout.n_local, self._free_map.shape[0])
         self._point_flux = csr_matrix((walls.flux.ravel(), (rows, points.ravel())), shape=shape)
@@ -114,7 +121,7 @@ class CutCellCoupling(Coupling):
         Shape (unknowns of the solid on this rank, dim), m^3 (m^2 in 2D):  -∫ N_i n (x_b - x_0,b) dA.
         """
         dim, layout = self.dim, self.solid.layout
-        points = (self.nodes[wet.facet] * dim)[:, :, None] + np.arange(dim)
+        points = (self._walls[wet.facet] * dim)[:, :, None] + np.arange(dim)
         rows = np.repeat(points.ravel(), dim)
         columns = np.tile(np.arange(dim), points.size)
         self._point_weight = csr_matrix((-wet.first.ravel(), (rows, columns)), shape=(self._free_map.shape[0], dim))

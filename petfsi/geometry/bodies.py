@@ -12,10 +12,11 @@ from petfsi.errors import InputError
 from petfsi.geometry.beams import axis_mesh
 from petfsi.geometry.meshes import build_mesh, read_surface
 from petfsi.geometry.places import Tags, located, located_facets, read_tags
-from petfsi.geometry.shapes import inside
+from petfsi.geometry.shapes import bounds, inside
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.scene.checks import check_inside_grid
 from petfsi.scene.schema import Obstacle, Scene, Solid
+from petfsi.scene.shape_checks import images, periods
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -49,7 +50,7 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
         except InputError as error:
             mistakes.append(str(error))
     mistakes += _in_obstacles(scene, meshes, clamped)
-    mistakes += _in_each_other(meshes)
+    mistakes += _in_each_other(meshes, periods(scene.fluid, scene.dim))
     if mistakes:
         raise InputError("\n".join(mistakes))
     return meshes
@@ -132,20 +133,31 @@ def _clamped(solid: Solid, points: np.ndarray, tags: Tags) -> np.ndarray:
 
 
 def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> np.ndarray:
-    if obstacle.shape.mesh is None:
-        covered = inside(obstacle.shape, points)
-    else:
-        covered = enclosed(*read_surface(obstacle.shape, scene.dim, key, scene.directory), points)
+    covered = np.zeros(len(points), dtype=bool)
+    if not len(points):
+        return covered
+    surface, reach = None, bounds(obstacle.shape)
+    if obstacle.shape.mesh is not None:
+        surface = read_surface(obstacle.shape, scene.dim, key, scene.directory)
+        reach = surface[0].min(axis=0), surface[0].max(axis=0)
+    shifts = [np.zeros(scene.dim)]
+    if reach is not None:
+        shifts = images(periods(scene.fluid, scene.dim), reach, (points.min(axis=0), points.max(axis=0)))
+    for shift in shifts:
+        at = points - shift
+        covered |= inside(obstacle.shape, at) if surface is None else enclosed(*surface, at)
     return covered != obstacle.outside
 
 
-def _in_each_other(meshes: dict[str, Mesh]) -> list[str]:
-    """Return a sentence for every pair of bodies that share material."""
+def _in_each_other(meshes: dict[str, Mesh], period: np.ndarray) -> list[str]:
+    """Return a sentence for every pair of bodies that share material, or whose images do."""
     found = []
     for first, second in combinations(meshes, 2):
-        pair = meshes[first], meshes[second]
-        count = _covered_cells(*pair) + _covered_cells(*reversed(pair))
-        if count or _cross(*pair):
+        (points, cells), other = meshes[first], meshes[second]
+        reach, other_reach = ((p.min(axis=0), p.max(axis=0)) for p in (points, other[0]))
+        pairs = [((points + shift, cells), other) for shift in images(period, reach, other_reach)]
+        count = sum(_covered_cells(*pair) + _covered_cells(*reversed(pair)) for pair in pairs)
+        if count or any(_cross(*pair) for pair in pairs):
             how = f"{count} cells" if count else "their outlines cross"
             found.append(f"solids.{second}.shape: overlaps solids.{first} ({how}); bodies must lie apart")
     return found

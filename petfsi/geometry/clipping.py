@@ -17,10 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from petfsi.geometry.neighbours import neighbours
 from petfsi.geometry.node_moments import node_integrals
+from petfsi.geometry.overlaps import Rest
 from petfsi.geometry.patches import Frame, Patches, find_patches
-from petfsi.geometry.pieces import Box, find_pieces
-from petfsi.geometry.slabs import area_vectors, to_lattice
+from petfsi.geometry.piece_accounts import Box
+from petfsi.geometry.pieces import find_pieces
+from petfsi.geometry.seams import Seams, overlapped
+from petfsi.geometry.slabs import area_vectors, off_planes
 
 #: Open fractions of faces nearer than this to 0 or 1 are 0 or 1: what rounding leaves of sums over a row.
 TINY = 1e-13
@@ -110,7 +114,12 @@ class CutCells:
 
 
 def cut(
-    points: np.ndarray, facets: np.ndarray, lattice: Lattice, base: int = 0, part: np.ndarray | None = None
+    points: np.ndarray,
+    facets: np.ndarray,
+    lattice: Lattice,
+    base: int = 0,
+    part: np.ndarray | None = None,
+    seams: Seams | None = None,
 ) -> CutCells:
     """Return a closed surface cut by the cells of a lattice.
 
@@ -126,38 +135,58 @@ def cut(
         How many of the solids reach to infinity (containers).
     part : ndarray of int8, shape (m,), or None
         Which part of a quadratic facet each facet is, as in ``quadratic.Curved``; None if none is.
+    seams : Seams, optional
+        Where surfaces reach around periodic axes; their points must be ``closed``. The answer knows the walls alone.
     """
     dim = points.shape[1]
     dx = np.asarray(lattice.dx, dtype=float)
-    x = to_lattice(np.asarray(points, dtype=float), facets, np.asarray(lattice.origin, dtype=float), dx)
+    x = (np.asarray(points, dtype=float) - np.asarray(lattice.origin)) / dx
+    ends, every, place = [facets[:0]] * dim, facets, None
+    if seams is not None:
+        part = None if part is None else part[seams.walls]
+        ends, facets = [facets[cap].astype(np.int32) for cap in seams.caps], facets[seams.walls]
+        x, place = overlapped(x, facets, seams, np.asarray(lattice.cells) * lattice.periodic), seams.place
+    x = off_planes(x, facets, place)
     area = area_vectors(x * dx, facets)
     size = np.linalg.norm(area, axis=1, keepdims=True)
     lo, hi = (np.asarray(end, dtype=np.int64) for end in (lattice.lo, lattice.hi))
     facets = np.ascontiguousarray(facets, dtype=np.int32)
-    images, near_lo, near_hi = _reach(x, facets, lattice, lo, hi)
+    images, near_lo, near_hi = _reach(x, every, lattice, lo, hi, ends)
     frame = Frame(near_lo - 1, near_hi + 1, dx, area / np.where(size > 0.0, size, 1.0))
     patches, sums = find_patches(x, facets, frame, images)
+    _begin(x, ends, frame, images, sums)
     shape = frame.hi - frame.lo
     count = np.bincount(patches.cell, minlength=int(np.prod(shape)))
     order = _order(patches.cell, count)
     integrals = patches.integrals
     patches = Patches(*(part[order] for part in patches._replace(integrals=integrals[:, :0])))
     opening = _open_faces(sums, count.reshape(shape), base)
+    inner, _ = _box_cells(patches.cell, frame, lo, hi)
+    box, beyond = Box(frame.lo, shape, images, lo, hi), neighbours(facets, len(x), seams, lattice.cells)
+    pieces = find_pieces(x, facets, beyond, box, patches, inner, opening, frame)
+    for fraction in opening:
+        np.maximum(fraction, 0.0, out=fraction)
+    integrals = integrals[order]
+    patch_piece = pieces.patch_piece
+    if pieces.rest is not None:
+        patches, integrals, patch_piece, remnant = _replaced(patches, integrals, patch_piece, pieces.rest)
     volume = _volumes(patches, frame, opening[-1])
     inner, cell = _box_cells(patches.cell, frame, lo, hi)
-    pieces = find_pieces(x, facets, Box(frame.lo, shape, images, lo, hi), patches, inner, opening)
     some = np.flatnonzero(inner & np.any(patches.vectors != 0.0, axis=1))
-    integrals = integrals[order[some]]
+    integrals = integrals[some]
     moments = integrals[:, dim:].reshape(-1, dim, dim)
     integrals = integrals[:, :dim]
     if part is not None:
         place = np.column_stack(np.unravel_index(patches.cell[some], shape)) + frame.lo - images[patches.image[some]]
         of = (frame, patches.facet[some], place)
-        integrals, moments = node_integrals(x, facets, part, *of, integrals, moments)
+        shapes = (np.full(len(some), -1), np.zeros((0, 2, 2 * dim)))
+        if pieces.rest is not None:
+            shapes = remnant[some], pieces.rest.polygons
+        integrals, moments = node_integrals(x, facets, part, *of, integrals, moments, shapes)
     return CutCells(
         facet=patches.facet[some],
         cell=cell[some],
-        piece=pieces.patch_piece[some],
+        piece=patch_piece[some],
         integrals=integrals,
         moments=moments,
         normals=frame.normals,
@@ -175,11 +204,12 @@ def cut(
 
 
 def _reach(
-    x: np.ndarray, facets: np.ndarray, lattice: Lattice, lo: np.ndarray, hi: np.ndarray
+    x: np.ndarray, facets: np.ndarray, lattice: Lattice, lo: np.ndarray, hi: np.ndarray, ends: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the periodic images of the surface that matter to the box, and the part of the box that they reach.
 
-    An image matters if it reaches into the box or its margin; what lies wholly below covers nothing in the end.
+    An image matters if it reaches into the box or its margin; what lies wholly below covers nothing in the end. The
+    first images along an axis around which surfaces reach are those whose lower ends lie below the box.
 
     Returns
     -------
@@ -198,14 +228,24 @@ def _reach(
         n = int(lattice.cells[a]) if lattice.periodic[a] else 0
         first = math.ceil((lo[a] - 1 - high[a]) / n) if n else 0
         last = math.floor((hi[a] + 1 - low[a]) / n) if n else 0
-        shifts.append([n * s for s in range(first, last + 1)])
         near_lo[a] = np.clip(math.floor(low[a]) + n * first, lo[a], hi[a])
         near_hi[a] = np.clip(math.floor(high[a]) + 1 + n * last, near_lo[a], hi[a])
+        if len(ends[a]):
+            first = min(first, math.floor((lo[a] - 2 - x[ends[a], a].max()) / n))
+        shifts.append([n * s for s in range(first, last + 1)])
     return np.array(list(itertools.product(*shifts)), dtype=np.int64).reshape(-1, dim), near_lo, near_hi
 
 
+def _begin(x: np.ndarray, ends: list[np.ndarray], frame: Frame, images: np.ndarray, sums: list[np.ndarray]) -> None:
+    """Add the lower ends of surfaces that reach around periodic axes: what their first images cover below the box."""
+    for a, facets in enumerate(ends):
+        if len(facets):
+            normals = np.zeros(facets.shape)
+            find_patches(x, facets, frame._replace(normals=normals), images[images[:, a] == images[:, a].min()], sums)
+
+
 def _open_faces(sums: list[np.ndarray], count: np.ndarray, base: int) -> list[np.ndarray]:
-    """Return the open fractions of the box's faces along each axis, the margin left out.
+    """Return the open fractions of the box's faces along each axis, the margin left out; below 0 where solids overlap.
 
     Parameters
     ----------
@@ -233,10 +273,30 @@ def _open_along(sums, count, base):
                 sums[i, j, k] += sums[i, j - 1, k]
         for j in range(1, sums.shape[1] - 1):
             for k in range(sums.shape[2]):
-                fraction = min(max(1.0 - base + sums[i, j, k], 0.0), 1.0)
+                # below 0 where solids overlap
+                fraction = min(1.0 - base + sums[i, j, k], 1.0)
                 whole = np.rint(fraction)
                 near = count[i, j - 1, k] > 0 or count[i, j, k] > 0
                 sums[i, j, k] = fraction if near and abs(fraction - whole) > TINY else whole
+
+
+def _replaced(
+    patches: Patches, integrals: np.ndarray, piece: np.ndarray, rest: Rest
+) -> tuple[Patches, np.ndarray, np.ndarray, np.ndarray]:
+    """Return patches, integrals and pieces with what is left of those that solids overlap in their place.
+
+    And which of the remnants each is, -1 for none.
+    """
+    keep = np.ones(len(patches.cell), dtype=bool)
+    keep[rest.gone] = False
+    take = np.concatenate((np.flatnonzero(keep), rest.patch))
+    order = np.argsort(patches.cell[take], kind="stable")
+    vectors = np.concatenate((patches.vectors[keep], rest.vectors))[order]
+    found = patches._replace(facet=patches.facet[take][order], image=patches.image[take][order])
+    found = found._replace(cell=patches.cell[take][order], edges=patches.edges[take][order], vectors=vectors)
+    both = np.concatenate((integrals[keep], rest.integrals))[order]
+    remnant = np.concatenate((np.full(keep.sum(), -1), np.arange(len(rest.patch))))
+    return found, both, np.concatenate((piece[keep], rest.piece))[order], remnant[order]
 
 
 def _volumes(patches: Patches, frame: Frame, opening: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ _RULES = {
 
 def node_integrals(
     x: np.ndarray, facets: np.ndarray, part: np.ndarray, frame: Frame, facet: np.ndarray, place: np.ndarray,
-    integrals: np.ndarray, moments: np.ndarray,
+    integrals: np.ndarray, moments: np.ndarray, shapes: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return integrals and moments of patches by the nodes of their facets, (n, width) and (n, width, dim).
 
@@ -43,6 +43,9 @@ def node_integrals(
         The cell of each patch where the surface itself is, not the image that the patch is of.
     integrals, moments : ndarray, shape (n, dim) and (n, dim, dim)
         Those of the corners, as in ``clipping.CutCells``.
+    shapes : tuple of ndarray
+        For patches that are parts of facets' parts in cells the number of their polygon, else -1, shape (n,); and these
+        polygons as in ``overlaps.Rest``.
     """
     dim, n = facets.shape[1], len(facet)
     pairs = np.array([(i, j) for i in range(dim) for j in range(i, dim)])
@@ -53,21 +56,26 @@ def node_integrals(
     bent = np.flatnonzero(part[facet] >= 0)
     _integrate(
         x, facets, part, facet, bent, place, frame.dx, frame.normals, pairs, np.ascontiguousarray(table), *_RULES[dim],
-        whole, first,
+        *shapes, whole, first,
     )  # fmt: skip
     return whole, first
 
 
 @njit(cache=True)
-def _integrate(x, facets, part, facet, bent, place, dx, normals, pairs, table, rule, weights, integrals, moments):
+def _integrate(
+    x, facets, part, facet, bent, place, dx, normals, pairs, table, rule, weights, own, polygons, integrals, moments
+):
     """Fill the rows ``bent`` of integrals and moments."""
     dim, width = len(dx), len(pairs)
     points, tags = np.empty((2, MOST, 2 * dim)), np.empty((2, MOST), np.int64)
     at, sums = np.empty(2 * dim), np.empty((width, 1 + dim))
     for p in bent:
         f = facet[p]
-        n = clip_to_cell(x, facets[f], place[p], points, tags)
-        polygon = points[1]
+        n, polygon = polygons.shape[1], points[1]
+        if own[p] >= 0:
+            polygon = polygons[own[p]]
+        else:
+            n = clip_to_cell(x, facets[f], place[p], points, tags)
         sums[:] = 0.0
         # a fan of triangles; in 2D one segment
         for i in range(1, n - (dim - 2)):

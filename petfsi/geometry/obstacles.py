@@ -12,6 +12,7 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.geometry.balls import unit_ball
 from petfsi.geometry.meshes import read_surface
+from petfsi.geometry.seams import MEET, Seams, find_seams
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.scene.schema import Ball, Box, Cylinder, Halfspace, Obstacle, Scene
 
@@ -37,11 +38,14 @@ class ObstacleSurfaces:
         Normals point out of what is solid; of a container into its room.
     base : int
         The number of containers: how many solids cover a place far away from all surfaces.
+    seams : Seams
+        Where they reach around periodic axes.
     """
 
     points: np.ndarray
     facets: np.ndarray
     base: int
+    seams: Seams
 
 
 def obstacle_surfaces(scene: Scene) -> ObstacleSurfaces:
@@ -64,6 +68,7 @@ def obstacle_surfaces(scene: Scene) -> ObstacleSurfaces:
         where = (f"obstacles.{name}.shape", scene.directory)
         try:
             x, f = obstacle_surface(obstacle, scene.dim, spacing, low, low + size, *where, periodic)
+            _check_length(x, size, periodic, where[0])
         except InputError as error:
             mistakes.append(str(error))
             continue
@@ -73,7 +78,20 @@ def obstacle_surfaces(scene: Scene) -> ObstacleSurfaces:
     if mistakes:
         raise InputError("\n".join(mistakes))
     base = sum(obstacle.outside for obstacle in scene.obstacles.values())
-    return ObstacleSurfaces(np.concatenate(points), np.concatenate(facets), base)
+    every = np.concatenate(points), np.concatenate(facets)
+    return ObstacleSurfaces(*every, base, find_seams(*every, size, np.array(periodic)))
+
+
+def _check_length(points: np.ndarray, size: np.ndarray, periodic: Sequence[bool], key: str) -> None:
+    """Raise if an obstacle would overlap its own images around a periodic axis."""
+    length = np.ptp(points, axis=0)
+    for axis, longer in zip("xyz", np.array(periodic) & (length > size * (1.0 + MEET)), strict=False):
+        if longer:
+            a = "xyz".index(axis)
+            raise InputError(
+                f"{key}: is {length[a]:g} m long along {axis}, which repeats after {size[a]:g} m; what reaches around "
+                "a periodic axis must be just so long, or a box, half space or cylinder along it"
+            )
 
 
 def obstacle_surface(
@@ -106,8 +124,8 @@ def obstacle_surface(
     directory : Path
         What a mesh file's path is relative to.
     periodic : sequence of bool, optional
-        The axes along which the grid, and the obstacle with it, repeats. A box or half space that reaches through
-        the whole grid along such an axis has no ends there: with its images it is closed.
+        The axes along which the grid, and the obstacle with it, repeats. A box, half space or cylinder that reaches
+        through the whole grid along such an axis is as long as the grid: its ends meet.
 
     Returns
     -------
@@ -123,7 +141,7 @@ def obstacle_surface(
     elif shape.ball is not None:
         points, facets = _ball(shape.ball, dim, spacing, f"{key}.ball.radius")
     elif shape.cylinder is not None:
-        points, facets = _cylinder(shape.cylinder, spacing, f"{key}.cylinder.radius")
+        points, facets = _cylinder(shape.cylinder, low, high, through, spacing, f"{key}.cylinder.radius")
     elif shape.halfspace is not None:
         points, facets = _halfspace(shape.halfspace, low, high, through)
     else:
@@ -136,9 +154,9 @@ def obstacle_surface(
 
 def _box(box: Box, low: np.ndarray, high: np.ndarray, periodic: np.ndarray) -> SurfaceMesh:
     origin, size = np.array(box.origin, dtype=float), np.array(box.size, dtype=float)
-    endless = periodic & (size >= high - low)
+    endless = periodic & (size >= (high - low) * (1.0 - MEET))
     origin, size = np.where(endless, low, origin), np.where(endless, high - low, size)
-    return _block(origin, np.diag(size), endless)
+    return _block(origin, np.diag(size))
 
 
 def _halfspace(halfspace: Halfspace, low: np.ndarray, high: np.ndarray, periodic: np.ndarray) -> SurfaceMesh:
@@ -153,9 +171,7 @@ def _halfspace(halfspace: Halfspace, low: np.ndarray, high: np.ndarray, periodic
     start[0], end[0] = min(start[0], -margin), 0.0
     repeats = (np.abs(axes) > 1.0 - 1e-12) & periodic
     repeats[0] = False
-    points, facets = _block(
-        np.array(halfspace.point) + start @ axes, axes * (end - start)[:, None], repeats.any(axis=1)
-    )
+    points, facets = _block(np.array(halfspace.point) + start @ axes, axes * (end - start)[:, None])
     middle = 0.5 * (low + high)
     return np.where(repeats.any(axis=0), np.where(points < middle, low, high), points), facets
 
@@ -170,8 +186,8 @@ def _frame(normal: np.ndarray) -> np.ndarray:
     return np.array([normal, first, np.cross(normal, first)])
 
 
-def _block(origin: np.ndarray, edges: np.ndarray, endless: np.ndarray) -> SurfaceMesh:
-    """Return the surface of the parallelepiped with these (right-handed) edges, without the ends of endless ones."""
+def _block(origin: np.ndarray, edges: np.ndarray) -> SurfaceMesh:
+    """Return the surface of the parallelepiped with these (right-handed) edges."""
     dim = len(origin)
     corner = np.array(np.meshgrid(*[[0, 1]] * dim, indexing="ij")).reshape(dim, -1).T
     if dim == 2:
@@ -180,9 +196,7 @@ def _block(origin: np.ndarray, edges: np.ndarray, endless: np.ndarray) -> Surfac
         # the sides x = 0, x = 1, y = 0, ... of a cube whose corners are numbered 4 x + 2 y + z
         sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
         facets = np.array([[(a, b, c), (a, c, d)] for a, b, c, d in sides]).reshape(-1, 3)
-    # an end is where all corners agree on the coordinate along an edge
-    flat = np.all(corner[facets] == corner[facets[:, :1]], axis=1)
-    return origin + corner @ edges, facets[~np.any(flat & endless, axis=1)]
+    return origin + corner @ edges, facets
 
 
 # ---- round --------------------------------------------------------------------------------------------------
@@ -257,9 +271,14 @@ def _within_faces(n: int, i: np.ndarray, j: np.ndarray, n_faces: int) -> np.ndar
     return (one + len(i) * np.arange(n_faces)[:, None, None]).reshape(-1, 3)
 
 
-def _cylinder(cylinder: Cylinder, spacing: float, key: str) -> SurfaceMesh:
+def _cylinder(
+    cylinder: Cylinder, low: np.ndarray, high: np.ndarray, periodic: np.ndarray, spacing: float, key: str
+) -> SurfaceMesh:
     """Return caps like meshed disks, and between them rows of triangles."""
-    start, end = np.array(cylinder.start), np.array(cylinder.end)
+    start, end = np.array(cylinder.start, dtype=float), np.array(cylinder.end, dtype=float)
+    along = np.abs(end - start)
+    endless = periodic & (along >= (high - low) * (1.0 - MEET)) & (along > (1.0 - 1e-12) * np.linalg.norm(along))
+    start, end = (np.where(endless, np.where(e > o, low, high), e) for e, o in ((start, end), (end, start)))
     length = float(np.linalg.norm(end - start))
     across = 2 * math.ceil(_around(cylinder.radius, spacing) / 8)
     rows = max(1, math.ceil(length / spacing))

@@ -54,15 +54,17 @@ class Patches(NamedTuple):
 
 
 def find_patches(
-    x: np.ndarray, facets: np.ndarray, frame: Frame, images: np.ndarray
+    x: np.ndarray, facets: np.ndarray, frame: Frame, images: np.ndarray, sums: list[np.ndarray] | None = None
 ) -> tuple[Patches, list[np.ndarray]]:
     """Return the patches in the box and its margin, and per axis the sums of area in front of each face.
 
-    The sums have one more entry along the axis than cells: the first is what lies below the box.
+    The sums have one more entry along the axis than cells: the first is what lies below the box. Those that are given
+    are added to.
     """
     dim = x.shape[1]
     shape = frame.hi - frame.lo
-    sums = [np.zeros(shape + (np.arange(dim) == a)) for a in range(dim)]
+    if sums is None:
+        sums = [np.zeros(shape + (np.arange(dim) == a)) for a in range(dim)]
     kernel = _clip_2d if dim == 2 else _clip_3d
     found = []
     for number, shift in enumerate(images):
@@ -145,7 +147,7 @@ def _clip_3d(x, facets, frame, sums0, sums1, sums2):
                         room = _enlarged(room)
                     integral, vector = room[3][count], room[4][count]
                     at[0], at[1], at[2] = i, j, k
-                    _measure_polygon(part[c], o, at, frame.dx, frame.normals[f], integral, vector)
+                    measure_polygon(part[c], o, at, frame.dx, frame.normals[f], integral, vector)
                     # what lies below the box has its area added to the first entry of its row
                     i_, j_, k_ = i - lo[0], j - lo[1], k - lo[2]
                     if j_ >= 0 and k_ >= 0:
@@ -186,7 +188,7 @@ def _clip_2d(x, facets, frame, sums0, sums1):
                     room = _enlarged(room)
                 integral, vector = room[3][count], room[4][count]
                 at[0], at[1] = i, j
-                _measure_segment(part[2], at, frame.dx, frame.normals[f], integral, vector)
+                measure_segment(part[2], at, frame.dx, frame.normals[f], integral, vector)
                 i_, j_ = i - lo[0], j - lo[1]
                 if j_ >= 0:
                     sums0[i_ + 1, j_] += vector[0]
@@ -221,7 +223,7 @@ def _near(points, n, lo, hi):
 
 
 @njit(cache=True)
-def _measure_polygon(points, n, at, dx, normal, integral, vector):
+def measure_polygon(points, n, at, dx, normal, integral, vector):
     """Set the integrals and vectors of a patch (see ``Patches``), by a fan of triangles; exact for what is integrated.
 
     The points are moved to be about the cell's centre.
@@ -255,7 +257,7 @@ def _measure_polygon(points, n, at, dx, normal, integral, vector):
 
 
 @njit(cache=True)
-def _measure_segment(points, at, dx, normal, integral, vector):
+def measure_segment(points, at, dx, normal, integral, vector):
     """Set the integrals and vectors of a patch (see ``Patches``)."""
     vector[0] = points[1, 1] - points[0, 1]
     vector[1] = points[0, 0] - points[1, 0]

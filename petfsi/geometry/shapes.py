@@ -41,6 +41,20 @@ def inside(shape: Shape, points: np.ndarray) -> np.ndarray:
     raise ValueError("only a box, ball, cylinder or half space has an analytic inside")
 
 
+def bounds(shape: Shape) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the lower and upper corner of a box, ball or cylinder; None of what has no end or is in a file."""
+    if shape.box is not None:
+        origin = np.array(shape.box.origin, dtype=float)
+        return origin, origin + np.array(shape.box.size)
+    if shape.ball is not None:
+        centre = np.array(shape.ball.centre, dtype=float)
+        return centre - shape.ball.radius, centre + shape.ball.radius
+    if shape.cylinder is not None:
+        ends = np.array([shape.cylinder.start, shape.cylinder.end], dtype=float)
+        return ends.min(axis=0) - shape.cylinder.radius, ends.max(axis=0) + shape.cylinder.radius
+    return None
+
+
 def _in_box(points: np.ndarray, origin: np.ndarray, size: np.ndarray) -> np.ndarray:
     slack = TOLERANCE * size.max()
     return np.all((points >= origin - slack) & (points <= origin + size + slack), axis=1)

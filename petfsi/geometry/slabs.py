@@ -174,21 +174,25 @@ def clip_to_cell(x, corners, cell, points, tags):
 SNAP = 1e-9
 
 
-def to_lattice(points: np.ndarray, facets: np.ndarray, origin: np.ndarray, dx: np.ndarray) -> np.ndarray:
+def off_planes(x: np.ndarray, facets: np.ndarray, place: np.ndarray | None = None) -> np.ndarray:
     """Return points in units of cells, none of them nearer than ``SNAP`` to a plane.
 
     A vertex at a plane is moved beyond it to where the solid grows, along the sum of the adjacent facets' area
-    vectors, so that a surface in a plane leaves no sliver of fluid.
+    vectors, so that a surface in a plane leaves no sliver of fluid. Points of one ``place`` (ndarray of int, shape
+    (n,)) move alike.
     """
-    x = (points - origin) / dx
     plane = np.rint(x)
     near = np.abs(x - plane) < SNAP
     if near.any():
         dim = x.shape[1]
-        area = area_vectors(points, facets)
+        x = x.copy()
+        area = area_vectors(x, facets)
         normal = np.zeros_like(x)
+        corners = facets.ravel() if place is None else place[facets].ravel()
         for a in range(dim):
-            normal[:, a] = np.bincount(facets.ravel(), weights=np.repeat(area[:, a], dim), minlength=len(x))
+            normal[:, a] = np.bincount(corners, weights=np.repeat(area[:, a], dim), minlength=len(x))
+        if place is not None:
+            normal = normal[place]
         x[near] = (plane + np.where(normal >= 0.0, SNAP, -SNAP))[near]
     return x
 

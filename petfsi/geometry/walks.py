@@ -52,6 +52,19 @@ def position_of(facets, facet):
 
 
 @njit(cache=True)
+def patch_of(facet, image, wanted, wanted_image):
+    """Return the number of the patch of a facet and image among patches in their order, -1 if there is none."""
+    low, high = 0, len(facet)
+    while low < high:
+        i = (low + high) // 2
+        if image[i] < wanted_image or (image[i] == wanted_image and facet[i] < wanted):
+            low = i + 1
+        else:
+            high = i
+    return low if low < len(facet) and image[low] == wanted_image and facet[low] == wanted else -1
+
+
+@njit(cache=True)
 def line_of(dim, axis, fixed, side, other_side):
     """Return the line along ``axis`` on the given side of axis ``fixed`` (and of the third one)."""
     if dim == 2:

@@ -9,7 +9,7 @@ from numba import njit
 
 from petfsi.geometry.slabs import MOST, PLANE, clip_to_cell
 from petfsi.geometry.union_find import join
-from petfsi.geometry.walks import find_lines, hit, line_of, stretch
+from petfsi.geometry.walks import find_lines, hit, line_of, patch_of, stretch
 
 
 class Traces(NamedTuple):
@@ -37,8 +37,8 @@ def walk_3d(x, facets, cells, facet, image, part, n_parts, opening, neighbours):
 
     Parameters
     ----------
-    neighbours : ndarray of int, shape (m, 3)
-        The facet beyond each edge.
+    neighbours : tuple of ndarray of int
+        The facet beyond each edge, and what else ``pieces.split_cells`` says of it.
     """
     n = len(facet)
     parent = np.arange(n_parts + 8)
@@ -141,7 +141,8 @@ def _join_loops(face, facet, image, part, traces, neighbours, lines, parent):
                 after = traces.after[q, face]
                 if after >= PLANE:
                     break
-                q = _patch(facet, image, neighbours[facet[q], after], image[q])
+                beyond, step, there = neighbours
+                q = patch_of(facet, image, beyond[facet[q], after], there[image[q], step[facet[q], after]])
                 good = good and q >= 0 and traces.after[q, face] >= 0
                 if not good:
                     return False
@@ -160,19 +161,6 @@ def _join_loops(face, facet, image, part, traces, neighbours, lines, parent):
             return False
         join(parent, part[first[loop]], node)
     return good
-
-
-@njit(cache=True)
-def _patch(facet, image, wanted, wanted_image):
-    """Return the number of the patch of a facet and image, -1 if there is none."""
-    low, high = 0, len(facet)
-    while low < high:
-        i = (low + high) // 2
-        if image[i] < wanted_image or (image[i] == wanted_image and facet[i] < wanted):
-            low = i + 1
-        else:
-            high = i
-    return low if low < len(facet) and image[low] == wanted_image and facet[low] == wanted else -1
 
 
 @njit(cache=True)

@@ -24,9 +24,11 @@ from petfsi.scene.shape_checks import (
     Problems,
     analytic_shape,
     extent,
+    images,
     is_measured,
     length,
     overlap,
+    periods,
     plain_shape,
     sizes,
     solid_shape,
@@ -236,11 +238,22 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
 
 
 def _outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
-    """Yield a problem if a bounding box does not lie in the grid, but for what reaches through an open side."""
+    """Yield a problem if a bounding box does not lie in the grid, but for what reaches through an open side.
+
+    Along a periodic axis every place is in the grid, and what is longer than the grid is not.
+    """
     if not is_measured(fluid, len(low)):
         return
-    for axis, a, b, start, size, sides in zip("xyz", low, high, fluid.origin, fluid.size, OPPOSITE, strict=False):
+    repeats = periods(fluid, len(low)) > 0.0
+    for n, (axis, a, b, start, size, sides) in enumerate(
+        zip("xyz", low, high, fluid.origin, fluid.size, OPPOSITE, strict=False)
+    ):
         end, slack = start + size, SLACK * size
+        if repeats[n]:
+            if b - a > size + slack:
+                allowed = f"{axis} must be no longer than the grid, {size:g} m, after which the scene repeats"
+                yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.size", "fluid.sides"))
+            continue
         # floats: a part of it at least must be in the grid
         through = [getattr(fluid.sides, side) == "open" and a < end and b > start for side in sides]
         if (a < start - slack and not through[0]) or (b > end + slack and not through[1]):
@@ -255,8 +268,12 @@ def _overlaps(scene: Scene) -> Problems:
         for name, solid in scene.solids.items()
         if solid.shape.cavity is None and extent(solid.shape, scene.dim) is not None
     ]
+    period = periods(scene.fluid, scene.dim) if scene.fluid is None or is_measured(scene.fluid, scene.dim) else None
     for (first, a), (second, b) in combinations(whole, 2):
-        if overlap(a, b, scene.dim):
+        reach, other = extent(a, scene.dim), extent(b, scene.dim)
+        assert reach is not None and other is not None
+        moves = [np.zeros(scene.dim)] if period is None else images(period, reach, other)
+        if any(overlap(a, b, scene.dim, shift) for shift in moves):
             allowed = f"overlaps solids.{first}; bodies must lie apart"
             yield Problem(f"solids.{second}.shape.{b.kinds[0]}", ABSENT, allowed, (f"solids.{first}.shape",))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 
@@ -19,6 +20,8 @@ OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
 NO_Z = "bounds z, which dim = 2 does not have"
 
 Problems = Iterator[Problem]
+#: The lower and upper corner of a bounding box.
+Reach = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
 
 
 def length(key: str, value: Sequence | None, dim: int) -> Problems:
@@ -152,12 +155,31 @@ def extent(shape: Shape, dim: int) -> tuple[list[float], list[float]] | None:
     return None
 
 
-def overlap(a: Shape, b: Shape, dim: int) -> bool:
-    """Whether two shapes, boxes or balls, share more than round-off.
+def periods(fluid: Fluid | None, dim: int) -> np.ndarray:
+    """Return after what length the scene repeats along each axis, m; 0 where it does not, shape (dim,)."""
+    if fluid is None:
+        return np.zeros(dim)
+    periodic = [getattr(fluid.sides, low) == getattr(fluid.sides, high) == "periodic" for low, high in OPPOSITE[:dim]]
+    return np.where(periodic, fluid.size, 0.0)
+
+
+def images(period: np.ndarray, one: Reach, other: Reach) -> list[np.ndarray]:
+    """Return by how much those images of one thing are moved that may meet another, m; each is its corners."""
+    (low, high), (low_b, high_b) = ([np.asarray(corner, dtype=float) for corner in reach] for reach in (one, other))
+    length = np.where(period > 0.0, period, 1.0)
+    first = np.where(period > 0.0, np.ceil((low_b - high) / length - SLACK), 0.0)
+    last = np.where(period > 0.0, np.floor((high_b - low) / length + SLACK), 0.0)
+    ranges = [np.arange(a, b + 1.0) for a, b in zip(first, last, strict=True)]
+    return [np.array(shift) * period for shift in itertools.product(*ranges)]
+
+
+def overlap(a: Shape, b: Shape, dim: int, shift: np.ndarray) -> bool:
+    """Whether two shapes, boxes or balls, share more than round-off, the first of them moved.
 
     A ball is a point, a box itself; what is left between the two must be longer than the radii together.
     """
     (low_a, high_a), (low_b, high_b) = (_core(shape, dim) for shape in (a, b))
+    low_a, high_a = low_a + shift, high_a + shift
     reach = sum(shape.ball.radius for shape in (a, b) if shape.ball is not None)
     gaps = np.maximum(low_b - high_a, low_a - high_b)
     if reach == 0:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from petfsi.fields.mac.cut import Walls, Wet
     from petfsi.fields.mac.cutgrid import CutGrid, Openings
     from petfsi.fields.mac.slivers import Slivers
+    from petfsi.geometry.seams import Seams
 
 
 #: What a step replaces before it is solved; none of it is changed in place.
@@ -123,7 +124,7 @@ class CoveredGrid(FluidField):
         from petfsi.geometry.obstacles import obstacle_surfaces
 
         surfaces = on_root(self.comm, lambda: obstacle_surfaces(scene))
-        return CutGrid(self.grid, self.surroundings, surfaces.points, surfaces.facets, surfaces.base)
+        return CutGrid(self.grid, self.surroundings, surfaces)
 
     def immerse(self, inside: np.ndarray | None, crossed: list[np.ndarray] | None) -> None:
         """Take over which cells solids cover and which faces their surfaces cut. Collective.
@@ -152,7 +153,16 @@ class CoveredGrid(FluidField):
             self.geometry_version += 1
             self._kinds_changed()
 
-    def cut(self, points: np.ndarray, facets: np.ndarray, part: np.ndarray | None = None) -> tuple[Walls, Wet]:
+    def find_seams(self, points: np.ndarray, facets: np.ndarray) -> Seams:
+        """Return where a closed surface meets itself around periodic axes. Not collective."""
+        from petfsi.geometry.seams import find_seams
+
+        grid = self.grid
+        return find_seams(points, facets, grid.size, np.array(grid.periodic[: grid.dim]))
+
+    def cut(
+        self, points: np.ndarray, facets: np.ndarray, part: np.ndarray | None = None, seams: Seams | None = None
+    ) -> tuple[Walls, Wet]:
         """Take over what a surface covers of cells and faces; return what it lets through, and bears. Collective.
 
         Parameters
@@ -163,9 +173,11 @@ class CoveredGrid(FluidField):
             Segments or triangles with normals into the fluid.
         part : ndarray of int8, shape (m,), or None
             As in ``quadratic.Curved``.
+        seams : Seams, optional
+            Where the surface reaches around periodic axes. In the answer facets are numbered among its walls.
         """
         assert self._cutter is not None
-        found = self._cutter.cut(points, facets, part)
+        found = self._cutter.cut(points, facets, part, seams)
         changed = any(
             not np.array_equal(new, old)
             for new, old in zip([found.cell_kind, *found.face_kind], [self.cell_kind, *self.face_kind], strict=True)
@@ -183,7 +195,8 @@ class CoveredGrid(FluidField):
             self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.slivers = found.slivers if self._moves else None
-        self.bounds = found.walls.facet, found.walls.slot - self.layout.start, len(facets)
+        n_walls = len(facets) if seams is None else len(seams.walls)
+        self.bounds = found.walls.facet, found.walls.slot - self.layout.start, n_walls
         self.geometry_version += 1
         return found.walls, found.wet
 

@@ -15,6 +15,8 @@ from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.sides import Surroundings
 from petfsi.fields.mac.slivers import Slivers, slivers_of
 from petfsi.geometry.clipping import CutCells, Lattice, cut
+from petfsi.geometry.obstacles import ObstacleSurfaces
+from petfsi.geometry.seams import Seams, find_seams, together
 from petfsi.petsc import IntType, Layout
 
 
@@ -67,17 +69,11 @@ class CutGrid:
     grid : MacGrid
     surroundings : Surroundings
         The sides; obstacles are not looked at.
-    points, facets : ndarray
-        Surfaces of the obstacles.
-    base : int
-        How many of them are containers.
+    obstacles : ObstacleSurfaces
     """
 
-    def __init__(
-        self, grid: MacGrid, surroundings: Surroundings, points: np.ndarray, facets: np.ndarray, base: int
-    ) -> None:
-        self.grid, self.surroundings = grid, surroundings
-        self.points, self.facets, self.base = points, facets, base
+    def __init__(self, grid: MacGrid, surroundings: Surroundings, obstacles: ObstacleSurfaces) -> None:
+        self.grid, self.surroundings, self.obstacles = grid, surroundings, obstacles
         dim = grid.dim
         lo, hi = np.array(grid.lo[:dim]), np.array(grid.hi[:dim])
         free = np.array(grid.periodic[:dim])
@@ -107,7 +103,9 @@ class CutGrid:
         view = array[part]
         return view if self.grid.dim == 3 else view[:, :, 0]
 
-    def cut(self, points: np.ndarray, facets: np.ndarray, part: np.ndarray | None = None) -> Openings:
+    def cut(
+        self, points: np.ndarray, facets: np.ndarray, part: np.ndarray | None = None, seams: Seams | None = None
+    ) -> Openings:
         """Return the openings that obstacles and a surface leave. Collective.
 
         Parameters
@@ -117,15 +115,21 @@ class CutGrid:
         facets : ndarray of int, shape (m, dim)
         part : ndarray of int8, shape (m,), or None
             As in ``quadratic.Curved``; None if no facet is part of a quadratic one.
+        seams : Seams or None
+            Where the surface reaches around periodic axes. In the answer facets are numbered among its walls.
         """
-        grid = self.grid
-        every = np.concatenate((points, self.points)), np.concatenate((facets, self.facets + len(points)))
+        grid, still = self.grid, self.obstacles
+        if seams is None:
+            seams = find_seams(points, facets, grid.size, np.array(grid.periodic[: grid.dim]))
+        n_points, n_moving = len(points), len(seams.walls)
+        points = seams.closed(points, grid.size, grid.dx)
+        every = np.concatenate((points, still.points)), np.concatenate((facets, still.facets + n_points))
         if part is not None:
-            part = np.concatenate((part, np.full(len(self.facets), -1, dtype=part.dtype)))
-        found = cut(*every, self.lattice, self.base, part)
+            part = np.concatenate((part, np.full(len(still.facets), -1, dtype=part.dtype)))
+        found = cut(*every, self.lattice, still.base, part, together(seams, still.seams, n_points, len(facets)))
         links = self._without_walls(links_of(found, self.shape))
         slot = patch_slots(found, len(self._flat))
-        walls = walls_of(found, slot, len(facets))
+        walls = walls_of(found, slot, n_moving)
         whole = self._whole_openings(found)
         openness, split = self._openness(whole, links)
         volume = grid.zeros_cells()
@@ -137,10 +141,10 @@ class CutGrid:
         solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
         walls = Walls(walls.facet[used], walls.axis[used], numbers[walls.slot[used]], walls.flux[used])
-        slivers = slivers_of(found, slot, len(facets), links, grid.dx, len(numbers))
+        slivers = slivers_of(found, slot, n_moving, links, grid.dx, len(numbers))
         used = np.flatnonzero(solved[slivers.slot])
         slivers = Slivers(numbers[slivers.slot[used]] - layout.start, slivers.size[used], slivers.normal[used])
-        patches = np.flatnonzero(solved[slot] & (found.facet < len(facets)))
+        patches = np.flatnonzero(solved[slot] & (found.facet < n_moving))
         wet = first_moments(found, patches, self._centres(found.cell[patches]))
         narrow = self._narrow(whole, face_kind)
         return Openings(cell_kind, face_kind, openness, narrow, volume, layout, index, extras, walls, wet, slivers)

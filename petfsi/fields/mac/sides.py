@@ -11,10 +11,11 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.fields.mac import kinds
 from petfsi.fields.mac.grid import MacGrid
-from petfsi.geometry.shapes import inside
+from petfsi.geometry.shapes import bounds, inside
 from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Inflow, InflowSide, Obstacle, Shape, Side, Sides
+from petfsi.scene.shape_checks import images
 
 T = TypeVar("T")
 
@@ -181,11 +182,19 @@ class Surroundings:
 
 def _covered_cells(grid: MacGrid, shape: Shape, key: str, directory: Path) -> np.ndarray:
     """Return which of this rank's own cells have their centres inside a shape. Collective."""
+    period = grid.size * np.array(grid.periodic[: grid.dim])
+    grid_reach = grid.origin, grid.origin + grid.size
+    covered = np.zeros(grid.owned_shape, dtype=bool)
     if shape.mesh is None:
-        index = tuple(i.ravel() for i in np.mgrid[grid.owned(None)])
-        return inside(shape, wrapped_points(grid, None, index)).reshape(grid.owned_shape)
+        reach = bounds(shape)
+        points = wrapped_points(grid, None, tuple(i.ravel() for i in np.mgrid[grid.owned(None)]))
+        for shift in [np.zeros(grid.dim)] if reach is None else images(period, reach, grid_reach):
+            covered |= inside(shape, points - shift).reshape(grid.owned_shape)
+        return covered
     from petfsi.geometry import meshes, rays
 
     points, facets = on_root(grid.comm, lambda: meshes.read_surface(shape, grid.dim, key, directory))
     lines = [grid.cell_centres(b)[part] for b, part in enumerate(grid.owned(None))]
-    return rays.inside_mask(points, facets, lines).astype(bool)
+    for shift in images(period, (points.min(axis=0), points.max(axis=0)), grid_reach):
+        covered |= rays.inside_mask(points + shift, facets, lines).astype(bool)
+    return covered

@@ -47,10 +47,12 @@ def probe(fluid: View, quantity: str, at: list[float]) -> float | np.ndarray:
     if quantity not in ("velocity", "pressure") and (quantity != "smoke" or fluid.smoke is None):
         raise InputError(f"probe of {quantity!r}: the fluid has velocity, pressure and, if the scene says so, smoke")
     place = (np.asarray(at, dtype=float) - grid.origin) / grid.dx
+    n_cells = np.array(grid.cells[: grid.dim])
+    place = np.where(grid.periodic[: grid.dim], np.mod(place, n_cells), place)
     # round-off must not put a point on a side outside
-    if np.any(place < -1e-9) or np.any(place > np.array(grid.cells[: grid.dim]) + 1e-9):
+    if np.any(place < -1e-9) or np.any(place > n_cells + 1e-9):
         raise InputError(f"probe at {list(map(float, at))}: must lie in the fluid's grid")
-    cell = np.clip(place.astype(int), 0, np.array(grid.cells[: grid.dim]) - 1)
+    cell = np.clip(place.astype(int), 0, n_cells - 1)
     here = all(grid.lo[b] <= cell[b] < grid.hi[b] for b in range(grid.dim))
     value = _value(fluid, quantity, place) if here else None
     owner = grid.comm.allgather(here).index(True)
