@@ -255,7 +255,8 @@ class MacFluid(CoveredGrid):
             known = v if self.narrow is None else v.copy()
             self._bands[axis].fill(known)
             if self.narrow is not None:
-                np.copyto(v, known, where=~self.narrow[axis])
+                slits = (self.openness[axis] < pressure.SLIT) & (self.face_kind[axis] == kinds.PRESSURE)
+                np.copyto(v, known, where=~self.narrow[axis] | slits)
                 self.grid.fill_sides(v, axis)
             self.grid.fill_sides(known, axis)
             extended.append(known)

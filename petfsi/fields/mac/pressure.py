@@ -23,6 +23,8 @@ POCKET_DIAGONAL = 1e-6
 #: The pressure sees a face that is open at all as open as this at least: between openings below it, round-off would
 #: become a flow. Only what the pressure drives goes through it, so that a flow which needs no pressure needs none.
 LEAST_OPEN = 1e-4
+#: Of faces less open than this the velocity is read from the band: it may be one that the least conductance has made.
+SLIT = 10 * LEAST_OPEN
 
 
 class Pattern:
