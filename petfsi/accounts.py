@@ -19,8 +19,9 @@ class Accounts:
     In SI units, in 2D per metre of thickness. Sums over time begin at zero.
 
     ``region_volume.1``, ...
-        Fluid in each region that was closed at the start, for the geometry at which the step was taken (cut cells:
-        exact for the surface; ray: whole cells). nan once it was opened, divided or joined with another.
+        Fluid in each region that was closed at the start, at the end of the step (cut cells: exact for the surface;
+        ray: whole cells, for the geometry at which the step was taken). nan once it was opened, divided or joined
+        with another.
     ``momentum.x``, ...
         Of the fluid, sum_f m_f v_f with m_f = rho alpha_f A_f dx over the faces that the pressure acts on (half of it
         at open sides), and of the solids. Of ``midpoint``, v is what the step's kick left.
@@ -36,8 +37,9 @@ class Accounts:
     ``load_work``
         Of the solids' body forces and loads so far, along the way that nodes moved.
     ``boundary_work``
-        What came in so far: the supports' reactions, the residual of their equations, times w dt; and through
-        inflows and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow.
+        What came in so far: the supports' reactions, the residual of their equations, times w dt; through inflows
+        and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow; and
+        with what closes the volume of regions, pressure times that.
     ``energy_residual``
         kinetic + elastic + potential + dissipated - load_work - boundary_work, less its initial value: what the
         scheme's own damping took (negative) or gave, with advection, cuts that change and what linearising a step
@@ -135,11 +137,9 @@ class Accounts:
         self.values["energy_residual"] = held - self._initial
 
     def state(self) -> dict[str, Slab]:
-        """Return the present row, where it began, and where the regions are."""
+        """Return the present row, and where it began."""
         numbers = self.values | {"initial_energy": self._initial}
-        arrays = {name: scalar_slab(self.comm, value) for name, value in numbers.items()}
-        tracked = self.regions is not None and any(name.startswith("region_volume") for name in self.values)
-        return arrays | (self.regions.state() if tracked and self.regions is not None else {})
+        return {name: scalar_slab(self.comm, value) for name, value in numbers.items()}
 
     def restore(self, read: Reader) -> None:
         """Take up a state, after ``start``. Collective."""
@@ -147,5 +147,3 @@ class Accounts:
         self._initial = float(read("initial_energy", (0,), (1,))[0])
         summed = ("potential", "dissipated", "load_work", "boundary_work")
         self._sums[:] = [self.values.get(name, 0.0) for name in summed]
-        if self.regions is not None and any(name.startswith("region_volume") for name in self.values):
-            self.regions.restore(read)

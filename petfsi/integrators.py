@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -54,6 +54,22 @@ class Stage:
     shift: np.ndarray
 
 
+class Turns(Protocol):
+    """What knows how a body turns, see ``fields.solid.turning``: by how much its first unknowns, or all, move."""
+
+    def onward(self, d: np.ndarray, before: np.ndarray, ratio: float) -> np.ndarray:
+        """Return what the prediction d + ratio (d - before) lacks, m."""
+        ...
+
+    def setting_out(self, d: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
+        """Return what the prediction d + h u lacks, m."""
+        ...
+
+    def in_place(self, d: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
+        """Return by how much d turns in h, m, without what else it does."""
+        ...
+
+
 class Integrator(Protocol):
     """What a scheme offers; ``h`` is the length of the coming step, ``past_dt`` that of the last one (0: none)."""
 
@@ -72,6 +88,11 @@ class Integrator(Protocol):
         """Whether k = 0, and the mass lumped, so that A is diagonal and a step beyond the stable one grows."""
         ...
 
+    @property
+    def swings(self) -> bool:
+        """Whether a step's end depends on the last w as on the next, so that w may swing about what leads there."""
+        ...
+
     def factor(self, h: float, past_dt: float) -> float:
         """Return 1/a, s: an acceleration acts so long on w, and the pressure's gradient on the fluid's velocity."""
         ...
@@ -84,12 +105,23 @@ class Integrator(Protocol):
         """Return the times after the step's begin (s) over which w of a prescribed velocity is the mean."""
         ...
 
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return how far w moves the nodes until the end of the step, s: k where w holds at the end."""
+        ...
+
     def solved(self, motion: Motion) -> np.ndarray:
         """Return w of the last step; before the first the velocity."""
         ...
 
     def stage(self, motion: Motion, h: float) -> Stage:
         """Return the equation of the coming step."""
+        ...
+
+    def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
+        """Return what turning adds to the first components of the d~ of ``stage``, m; None is nothing.
+
+        A straight way swells a body that turns by the square of the angle, and its stiffness makes that a force.
+        """
         ...
 
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
@@ -106,6 +138,9 @@ class Newmark:
         (M/h + C + h/2 K') u^{n+1} - J p^{n+1} = (M/h - h/2 K') u^n - K(d^n) + f_e^{n+1},
         d^{n+1} = d^n + h/2 (u^n + u^{n+1}).
 
+    Where a body turns, by ``turned``, K and K' are taken at d~, which is d^n turned as far as the body goes on to do
+    in the step, and K(d^n) becomes K(d~) + K' (d^n - d~): the same equation, linearised elsewhere.
+
     References
     ----------
     N. Chentanez, T. G. Goktekin, B. E. Feldman, J. F. O'Brien, Simultaneous coupling of fluids and deformable
@@ -115,6 +150,7 @@ class Newmark:
     order: ClassVar[int] = 1
     past: ClassVar[tuple[str, ...]] = ()
     explicit: ClassVar[bool] = False
+    swings: ClassVar[bool] = True
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return h."""
@@ -128,6 +164,10 @@ class Newmark:
         """Return the end of the step."""
         return (h,)
 
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return k."""
+        return stage.k
+
     def solved(self, motion: Motion) -> np.ndarray:
         """Return u^n."""
         return motion.velocity
@@ -136,6 +176,10 @@ class Newmark:
         """Return eq. 18."""
         d, u = motion.displacement, motion.velocity
         return Stage(a=1 / h, k=h / 2, inertia=u / h, tangent_at=d, shift=h / 2 * u)
+
+    def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
+        """Return by how much d^n turns in the step: d~ goes nowhere else."""
+        return turns.in_place(motion.displacement, motion.velocity, h)
 
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
         """Return u^{n+1} = w and d^{n+1} of eq. 12."""
@@ -162,6 +206,7 @@ class Bdf2:
     order: ClassVar[int] = 2
     past: ClassVar[tuple[str, ...]] = ("displacement_before", "velocity_before")
     explicit: ClassVar[bool] = False
+    swings: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return c; 2h/3 for equal steps, h in the first one."""
@@ -182,6 +227,10 @@ class Bdf2:
         """Return the end of the step."""
         return (h,)
 
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return k."""
+        return stage.k
+
     def solved(self, motion: Motion) -> np.ndarray:
         """Return u^n."""
         return motion.velocity
@@ -201,6 +250,12 @@ class Bdf2:
             tangent_at=ahead,
             shift=b * d - b_past * before_d - ahead,
         )
+
+    def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
+        """Return what d~ lacks of where the body turns to."""
+        if motion.past_dt == 0.0:
+            return turns.setting_out(motion.displacement, motion.velocity, h)
+        return turns.onward(motion.displacement, motion.past[0], h / motion.past_dt)
 
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
         """Return u^{n+1} = w and the d^{n+1} whose derivative it is."""
@@ -226,6 +281,7 @@ class Midpoint:
     order: ClassVar[int] = 2
     past: ClassVar[tuple[str, ...]] = ("velocity_middle", "velocity_ahead")
     explicit: ClassVar[bool] = False
+    swings: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return h/2."""
@@ -258,6 +314,10 @@ class Midpoint:
         """
         return ahead if past_dt == 0.0 or span == 0.0 else ahead + 2 * span / past_dt * (ahead - w)
 
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return h."""
+        return h
+
     def solved(self, motion: Motion) -> np.ndarray:
         """Return the velocity in the middle of the last step."""
         return motion.past[0] if motion.past_dt else motion.velocity
@@ -268,6 +328,10 @@ class Midpoint:
         w, ahead = motion.past if motion.past_dt else (u, u)
         step = h / 2 * self.later(ahead, w, h / 2, motion.past_dt)
         return Stage(a=2 / h, k=h / 2, inertia=2 / h * u, tangent_at=d + step, shift=-step)
+
+    def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
+        """Return None: the middle of the way is within h^3 of where a turning body's nodes are taken to be."""
+        return None
 
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
         """Return the end of the step."""
@@ -294,6 +358,7 @@ class SymplecticEuler:
     order: ClassVar[int] = 1
     past: ClassVar[tuple[str, ...]] = ()
     explicit: ClassVar[bool] = True
+    swings: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return h."""
@@ -307,6 +372,10 @@ class SymplecticEuler:
         """Return the end of the step."""
         return (h,)
 
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return h."""
+        return h
+
     def solved(self, motion: Motion) -> np.ndarray:
         """Return u^n."""
         return motion.velocity
@@ -315,6 +384,10 @@ class SymplecticEuler:
         """Return the equation without damping, which who knows a1 adds by ``shift`` = a1 u^n."""
         u = motion.velocity
         return Stage(a=1 / h, k=0.0, inertia=u / h, tangent_at=motion.displacement, shift=np.zeros_like(u))
+
+    def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
+        """Return None: forces are taken where the body is."""
+        return None
 
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
         """Return u^{n+1} = w and d^{n+1}."""
@@ -356,6 +429,7 @@ class Static:
     order: ClassVar[int] = 1
     past: ClassVar[tuple[str, ...]] = ("rate",)
     explicit: ClassVar[bool] = False
+    swings: ClassVar[bool] = False
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return infinity: nothing resists being accelerated."""
@@ -369,6 +443,10 @@ class Static:
         """Return both ends: the mean brings a prescribed node to within the trapezoidal rule of its place."""
         return (0.0, h)
 
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return h."""
+        return h
+
     def solved(self, motion: Motion) -> np.ndarray:
         """Return the rate of the last step."""
         return motion.past[0] if motion.past_dt else np.zeros_like(motion.velocity)
@@ -377,6 +455,10 @@ class Static:
         """Return the equilibrium at the end of the step."""
         d = motion.displacement
         return Stage(a=0.0, k=h, inertia=np.zeros_like(d), tangent_at=d, shift=np.zeros_like(d))
+
+    def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
+        """Return None: nothing turns by itself."""
+        return None
 
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
         """Return the new equilibrium, at rest."""
@@ -390,6 +472,13 @@ def relinearised(stage: Stage, w: np.ndarray) -> Stage:
     """
     move = stage.k * w
     return Stage(stage.a, stage.k, stage.inertia, stage.tangent_at + stage.shift + move, -move)
+
+
+def moved(stage: Stage, by: np.ndarray) -> Stage:
+    """Return the same equation, linearised elsewhere: the first components of d~ are moved by so much."""
+    way = np.zeros_like(stage.tangent_at)
+    way[:, : by.shape[1]] = by
+    return replace(stage, tangent_at=stage.tangent_at + way, shift=stage.shift - way)
 
 
 #: The scene's ``time.integrator`` by name.

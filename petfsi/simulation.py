@@ -24,6 +24,10 @@ from petfsi.system import System
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
 
+#: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
+#: is left.
+REPEATS = 6
+
 
 class Simulation:
     """Fields, couplings and solver of a scene, at one instant.
@@ -65,7 +69,9 @@ class Simulation:
         self._retries = 0 if self.stable.limited else scene.time.retries
         self.substeps = 1
         self.report: Callable[[str], None] = lambda text: None
-        self.regions = ClosedRegions(self.system, self.fluid, self.solver.decoupled) if self.fluid else None
+        self.regions: ClosedRegions | None = None
+        if self.fluid:
+            self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
@@ -133,7 +139,7 @@ class Simulation:
         with self.phase("assemble"):
             changed = self._assemble(t, dt)
         with self.phase("solve"):
-            outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt))
+            outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
         with self.phase("accept"):
             self._accept(t, dt)
             if len(self.fields) > 1 or not self.stable.limited:  # else no step makes any
@@ -166,6 +172,9 @@ class Simulation:
         return self.solver.check_options()
 
     def _assemble(self, t: float, dt: float) -> bool:
+        if self.regions:
+            self.regions.find()
+            self.regions.aim(t, dt)
         for field in self.fields:
             field.assemble(t, dt)
         for coupling in self.couplings:
@@ -177,8 +186,21 @@ class Simulation:
                 self.regions.adopt(self.system)
         changed = self.system.refresh()
         if self.regions:
-            self.regions.refresh()
+            self.regions.attach()
         return changed
+
+    def _close(self, t: float, dt: float) -> Outcome:
+        """Solve again, with sources that close the volumes of regions, while that is wanted. Collective."""
+        outcome = Outcome(0, 0.0)
+        if not self.regions or not self.solid or isinstance(self.solver, DiagonalSolver):
+            return outcome
+        for repeat in range(REPEATS + 1):
+            self.regions.measure(self.system.values()[self.fields.index(self.solid)], dt)
+            if repeat == REPEATS or self.solver.fixed_iterations or not self.regions.improve():
+                break
+            self.system.refresh(guess=False)
+            outcome += self.solver.improve(lambda values: self._restage(values, t, dt))
+        return outcome
 
     def _restage(self, values: list[np.ndarray], t: float, dt: float) -> bool:
         """Make the system that of other values of the fields; return whether the operator has changed. Collective."""
@@ -202,6 +224,11 @@ class Simulation:
             coupling.accept(t, dt)
         if self.fluid:
             self.fluid.accept(values["pressure"], t, dt)
+        if self.regions:
+            self.regions.settle()
+        remark = self.solid.remark(dt) if self.solid else None
+        if remark:
+            self.report(f"t = {t + dt:.6g} s: {remark}")
         self.accounts.update(values.get("pressure"), dt)
 
     def _check_speed(self, solid: SolidField, velocity: np.ndarray, dt: float) -> None:
@@ -259,8 +286,10 @@ class Simulation:
         }
 
     def state(self) -> dict[str, dict[str, Slab]]:
-        """Return all that the next step reads, by field, what accounts add to, and the stable step."""
+        """Return all that the next step reads: by field, closed regions, what accounts add to, and the stable step."""
         states = {field.name: field.state() for field in self.fields}
+        if self.regions:
+            states["regions"] = self.regions.state()
         if self.accounts.columns:
             states["accounts"] = self.accounts.state()
         if self.stable.limited:
@@ -279,6 +308,8 @@ class Simulation:
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
+        if self.regions:
+            self.regions.restore(group("regions"))
         if self.accounts.columns:
             self.accounts.restore(group("accounts"))
         if self.stable.limited:

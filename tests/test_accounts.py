@@ -100,7 +100,7 @@ def test_a_closed_box_only_loses(integrator, transfer):
     got = history(data, 15)
     assert got["energy_residual"][-1] < -0.05 * got["kinetic"][0]
     assert np.all(np.diff(got["energy_residual"]) < 1e-3 * got["kinetic"][0])
-    assert np.all(got["boundary_work"] == 0.0)
+    assert np.abs(got["boundary_work"]).max() < 1e-5 * got["kinetic"][0]  # what closes the volume is all there is
     if transfer == "cutcell":
         # the start is no flow yet: nodes go half of their first step with its velocities
         np.testing.assert_allclose(got["region_volume.1"][2:], got["region_volume.1"][2], rtol=1e-8)
@@ -228,6 +228,9 @@ class Cells:
     def volumes(self):
         return np.array([1.0, 2.0, 4.0, 8.0])
 
+    def inflow(self):
+        return None
+
 
 class Empty:
     """Stands in for a system without couplings."""
@@ -246,18 +249,16 @@ class Empty:
         ([(0, 0, 0, 1)], [np.nan, 8.0]),  # opened or filled
     ],
 )
-def test_a_region_keeps_its_number_as_long_as_it_is_one(later, wanted, monkeypatch):
-    monkeypatch.setattr("petfsi.regions._attach", lambda mat, members: None)
-    monkeypatch.setattr(Cells, "block", None, raising=False)
+def test_a_region_keeps_its_number_as_long_as_it_is_one(later, wanted):
     cells = Cells((1, 1, 0, 0), (0, 0, 1, 1))
-    regions = ClosedRegions(Empty(), cells, decoupled=False)
-    regions.refresh()
+    regions = ClosedRegions(Empty(), cells, None, decoupled=False)
+    regions.find()
     assert regions.volumes.tolist() == [3.0, 12.0]
     cells.members, cells.geometry_version = later, 1
-    regions.refresh()
+    regions.find()
     np.testing.assert_array_equal(regions.volumes, wanted)
     cells.geometry_version = 2
-    regions.refresh()
+    regions.find()
     np.testing.assert_array_equal(regions.volumes, wanted)
 
 

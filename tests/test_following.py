@@ -8,7 +8,6 @@ from mac_cases import reader, whole
 from mpi4py import MPI
 
 from petfsi.bench.case import only_options
-from petfsi.following import Marks, follow
 from petfsi.scene.load import scene_from_dict
 from petfsi.simulation import Simulation
 
@@ -87,21 +86,6 @@ def test_regions_that_begin_in_one_divided_cell_are_in_the_order_of_its_pieces()
     volumes = run(data, 0)[0]
     between = room(*outer[1:]) - np.prod(inner[1])
     np.testing.assert_allclose(volumes, [4.0 - np.prod(outer[1]), between, room(*inner[1:])], rtol=1e-7)
-
-
-@pytest.mark.parallel([1, 2])
-def test_what_facets_bound_is_followed_and_other_regions_by_their_cells():
-    shape = (4 if COMM.rank == 0 else 2,)
-    none = np.zeros(shape, dtype=np.int64)
-    before = Marks(none, np.array([1, 1, 2, 2, 0]))
-    for now, wanted in (([2, 2, 1, 0, 0], [(0, 1), (1, 0)]), ([1, 2, 3, 3, 0], [(1, 2)]), ([1, 1, 1, 1, 0], [])):
-        old, new = follow(COMM, before, Marks(none, np.array(now)), 2, 3)
-        assert list(zip(old, new, strict=True)) == wanted
-    first = none.copy()
-    first[0] = 1
-    # region 1 has no facets, and 2 none any more
-    old, new = follow(COMM, Marks(first, np.array([2, 2])), Marks(2 * first, np.array([1, 1])), 2, 2)
-    assert list(zip(old, new, strict=True)) == [(0, 1), (1, 0)]
 
 
 @pytest.mark.parallel([1, 2])

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from petsc4py import PETSc
 
+from petfsi.couplings.enclosure import Enclosure
 from petfsi.fields.base import Work
 
 
@@ -53,6 +54,17 @@ class Coupling(ABC):
         To be called after the fields have assembled the step from ``time`` to ``time + dt``.
         """
 
+    def enclose(self, members: list[np.ndarray]) -> Enclosure | None:
+        """Return what bounds regions of the fluid, each 1 on its unknowns and 0 elsewhere; None if that is not exact.
+
+        For the geometry that ``couple`` saw last.
+        """
+        return None
+
+    @abstractmethod
+    def inject(self, volume: np.ndarray) -> None:
+        """Add what comes into cells from nowhere, m^3/s (m^2/s in 2D), to the right sides that are assembled."""
+
     @abstractmethod
     def rewind(self) -> None:
         """Forget for which positions the operators are: the fields forget the step that was tried."""
@@ -61,7 +73,8 @@ class Coupling(ABC):
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return this rank's share of what the coupling's own forces did in the step last accepted.
 
-        Supports bear the pressure on prescribed points, and the fluid's weight there: minus that is their work.
+        Supports bear the pressure on prescribed points, and the fluid's weight there: minus that is their work. What
+        comes into cells from nowhere (``FluidField.source``) brings its volume times the pressure.
 
         Parameters
         ----------

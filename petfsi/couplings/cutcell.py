@@ -10,15 +10,17 @@ from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.blocks import Rows, TransferBlocks
+from petfsi.couplings.enclosure import Enclosure
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
 from petfsi.geometry.seams import Seams
+from petfsi.geometry.slabs import to_lattice
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_triplets, row_sums, sum_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
-    from petfsi.fields.mac.cut import Wet
+    from petfsi.fields.mac.cut import Walls, Wet
     from petfsi.fields.mac.fluid import MacFluid
 
 
@@ -84,7 +86,7 @@ class CutCellCoupling(Coupling):
             self._seams = self.fluid.find_seams(positions, self.facets)
         part = None if self.curved is None else self.curved.part
         walls, wet = self.fluid.cut(positions, self.facets, part, self._seams)
-        self._walls = self.nodes[self._seams.walls]
+        self._walls, self._let_through = self.nodes[self._seams.walls], walls
         layout = self.fluid.layout
         points = self._walls[walls.facet] * self.dim + walls.axis[:, None]
         rows = np.repeat(walls.slot - layout.start, self.nodes.shape[1])
@@ -143,8 +145,7 @@ class CutCellCoupling(Coupling):
             self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
             self._held_outflow = self._point_flux @ self._held
             self.fluid.rhs -= self._held_outflow
-        if self.fluid.slivers is not None:
-            self._press_slivers()
+        self.fluid.rhs[:] = self._pressed(self.fluid.rhs)
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
 
@@ -160,34 +161,59 @@ class CutCellCoupling(Coupling):
         cells = layout.start + np.repeat(np.arange(layout.n_local), np.diff(indptr))
         return flux, gather_triplets(self.comm, self.solid.layout, columns, cells, -values)
 
-    def _press_slivers(self) -> None:
-        """Let the known outflow act through the slivers, on the solid and on the pressure rows. Collective."""
+    def _pressed(self, known: np.ndarray) -> np.ndarray:
+        """Let what comes into cells act through the slivers on the solid; return what it is to the pressure's rows.
+
+        Collective.
+        """
         fluid, slivers = self.fluid, self.fluid.slivers
-        assert slivers is not None
+        if slivers is None:
+            return known
         thick = np.flatnonzero(slivers.size > 0.0)
-        force = fluid.density / self._factor * slivers.size[thick] * fluid.rhs[slivers.slot[thick]]
+        force = fluid.density / self._factor * slivers.size[thick] * known[slivers.slot[thick]]
         n = fluid.layout.n_local
         column = np.arange(n + 1), np.zeros(n, dtype=np.int64), np.ones(n)
         entries = outer_products(*self._flux, *column, slivers.slot[thick], force)
         self.solid.rhs += row_sums(*gather_triplets(self.comm, self.solid.layout, *entries))
-        fluid.rhs += fluid.spread(fluid.rhs)
+        return known + fluid.spread(known)
+
+    def enclose(self, members: list[np.ndarray]) -> Enclosure | None:
+        """Return what bounds regions of the fluid, each 1 on its unknowns and 0 elsewhere."""
+        grid = self.fluid.grid
+        assert self._positions is not None
+        # vertices at planes of the grid were moved a little
+        cut_at = grid.origin + grid.dx * to_lattice(self._positions, self.facets, grid.origin, grid.dx)
+        assert self._seams is not None
+        walls, start = self._seams.walls, self.fluid.layout.start
+        curved = None if self.curved is None else self.curved.take(walls)
+        return Enclosure(cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved)
+
+    def inject(self, volume: np.ndarray) -> None:
+        """Add what comes into cells from nowhere to the right sides. Collective."""
+        self.fluid.rhs += self._pressed(volume)
 
     def rewind(self) -> None:
         """Make the operators anew, and the fluid's cells with them, in the next step."""
         self._positions = None
 
     def work(self, pressure: np.ndarray, dt: float) -> Work:
-        """Return the work of the fluid's weight on all points, and what supports do against it and the pressure."""
+        """Return the work of the fluid's weight on all points, and what is done against it and the pressure.
+
+        By supports, and by what comes into cells from nowhere.
+        """
         held = free = 0.0
         if self.fluid.weight is not None:
             gradient = self.fluid.weight.gradient
             free = float(self.solid.moved @ (self._weight @ gradient))
             held = dt * float(self._held @ (self._point_weight @ gradient))
-        pressed = 0.0
+        pressed, outflow = 0.0, np.zeros_like(pressure)
         if self.surface.fixed_map.nnz:
-            outflow = self._held_outflow
+            outflow += self._held_outflow
+        if self.fluid.source is not None:
+            outflow -= self.fluid.source
+        if self.surface.fixed_map.nnz or self.fluid.source is not None:
             if self.fluid.slivers is not None:
-                outflow = outflow + self.fluid.spread(outflow, only_thin=False)
+                outflow += self.fluid.spread(outflow, only_thin=False)
             pressed = dt * float(pressure @ outflow)
         return Work(gravity=free + held, boundary=-pressed - held)
 

@@ -228,6 +228,10 @@ class RayCoupling(Coupling):
             self._held_outflow = self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
             self.fluid.rhs -= self._held_outflow
 
+    def inject(self, volume: np.ndarray) -> None:
+        """Add what comes into cells from nowhere to the fluid's right side."""
+        self.fluid.rhs += volume
+
     def rewind(self) -> None:
         """Make the operators anew, and the fluid's cells with them, in the next step."""
         self._positions = None

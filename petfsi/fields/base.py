@@ -78,6 +78,25 @@ class Work:
     loads: float = 0.0
 
 
+@dataclass(frozen=True)
+class Landing:
+    """How a solid's step brings its nodes to where they are at its end.
+
+    Attributes
+    ----------
+    holds : bool
+        Whether the step's equations hold there.
+    stride : float
+        How far the solution w moves the nodes, s.
+    swings : bool
+        See ``integrators.Integrator``.
+    """
+
+    holds: bool
+    stride: float
+    swings: bool
+
+
 #: Reads the piece ``[start, start + count)`` of the stored array of that name: ``read(name, start, count)``.
 Reader = Callable[[str, tuple[int, ...], tuple[int, ...]], np.ndarray]
 
@@ -204,9 +223,8 @@ class FluidField(Field):
     fluxes : PETSc.Mat
         What the block consists of for the most part, with a pattern that seldom changes: what preconditioners are made
         of. May be the block itself. ``pattern_version`` is its.
-    bounds : tuple of (ndarray, ndarray, int), or None
-        Facets of a surface and the local unknowns that they bound, pair by pair, and how many facets there are; None
-        where this is not known.
+    source : ndarray or None
+        By unknown, what comes into cells from nowhere, m^3/s (m^2/s in 2D): ``assemble`` adds it to ``rhs``.
     """
 
     comm: MPI.Comm
@@ -214,8 +232,8 @@ class FluidField(Field):
     cell_volume: float
     n_cells: int
     fluxes: PETSc.Mat
-    bounds: tuple[np.ndarray, np.ndarray, int] | None = None
     geometry_version: int = 0
+    source: np.ndarray | None = None
 
     @property
     def matrices(self) -> list[PETSc.Mat]:
@@ -232,6 +250,10 @@ class FluidField(Field):
     @abstractmethod
     def volumes(self) -> np.ndarray:
         """Return the volume of fluid that belongs to each of this rank's unknowns, m^3 (m^2 in 2D)."""
+
+    @abstractmethod
+    def inflow(self) -> np.ndarray | None:
+        """Return by unknown what the step lets in through sides with a given velocity; None if there are none."""
 
     @abstractmethod
     def cells_slab(self, values: np.ndarray) -> Slab:
@@ -285,6 +307,10 @@ class SolidField(Field):
         """
         return
 
+    def remark(self, dt: float) -> str | None:
+        """Return what a user should know of the step of dt last accepted, each thing once. Collective."""
+        return None
+
     @abstractmethod
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""
@@ -321,6 +347,28 @@ class SolidField(Field):
 
         Between ``predict`` and ``accept`` those at which the step's equations are taken, otherwise the present ones.
         """
+
+    @abstractmethod
+    def surface_present(self) -> np.ndarray:
+        """Return the present positions of its points, shape (n_points, dim), on every rank. Collective."""
+
+    @abstractmethod
+    def surface_shift(self) -> np.ndarray:
+        """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective.
+
+        To first order, by the surface's maps, shape (n_points, dim), m; between ``predict`` and ``accept``.
+        """
+
+    @abstractmethod
+    def surface_arrival(self, x: np.ndarray | None, dt: float) -> np.ndarray:
+        """Return where its points are after a step of dt with the solution x (SI; None: zero). Collective.
+
+        Shape (n_points, dim), on every rank.
+        """
+
+    @abstractmethod
+    def landing(self, dt: float) -> Landing:
+        """Return how a step of dt brings nodes to its end."""
 
     @abstractmethod
     def surface_velocity(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix, vstack
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work
+from petfsi.fields.base import Landing, Reader, Slab, SolidField, Stock, Work
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, slab
@@ -174,6 +174,11 @@ class JointSolid(SolidField):
         for part, mine in self._split(x):
             part.judge(mine, dt)
 
+    def remark(self, dt: float) -> str | None:
+        """Return what the parts remark. Collective."""
+        found = [text for text in [part.remark(dt) for part in self.parts] if text]
+        return "; ".join(found) or None
+
     @property
     def finest(self) -> float:
         """Length of the shortest edge of any part at rest, m. Collective at first."""
@@ -239,6 +244,23 @@ class JointSolid(SolidField):
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, dim). Collective."""
         return np.concatenate([part.surface_positions() for part in self.parts])
+
+    def surface_present(self) -> np.ndarray:
+        """Return the present positions of its points, shape (n_points, dim). Collective."""
+        return np.concatenate([part.surface_present() for part in self.parts])
+
+    def surface_shift(self) -> np.ndarray:
+        """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective."""
+        return np.concatenate([part.surface_shift() for part in self.parts])
+
+    def surface_arrival(self, x: np.ndarray | None, dt: float) -> np.ndarray:
+        """Return where its points are after a step of dt with the solution x (None: zero). Collective."""
+        every = np.zeros(self.layout.n_local) if x is None else x
+        return np.concatenate([part.surface_arrival(mine, dt) for part, mine in self._split(every)])
+
+    def landing(self, dt: float) -> Landing:
+        """Return how a step of dt brings nodes to its end."""
+        return self.parts[0].landing(dt)
 
     def surface_velocity(self) -> np.ndarray:
         """Return the solution of the step last accepted at the surface's points, shape (n_points, dim). Collective."""

@@ -73,6 +73,16 @@ class BeamSolid(NodalSolid):
         theory = next(iter(self._beams.values())).theory
         return BeamElements(self._mesh.points, self._mesh.cells, self._mesh.body, self._sections(solids), theory)
 
+    def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the axis' segments between nodes, of beams that may turn as far as they like, and EA/2.
+
+        What the angles do is straight in time as it is.
+        """
+        cells, body, modulus = self._mesh.cells, self._mesh.body, self._elements.sections.stiffness[:, 0] / 2
+        if cells.shape[1] == 2:
+            return cells[:0], body[:0], modulus
+        return np.concatenate((cells[:, [0, 2]], cells[:, [2, 1]])), np.concatenate((body, body)), modulus
+
     def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> BeamLoads | None:
         if not any(solid.loads or solid.body_force for solid in solids.values()):
             return None
@@ -177,14 +187,33 @@ class BeamSolid(NodalSolid):
 
         From ``predict`` to ``accept`` those where the step's tangent is taken, otherwise the present ones.
         """
-        d = self._present_geometry()
+        return self._outline(self._present_geometry())
+
+    def _outline(self, d: np.ndarray) -> np.ndarray:
+        """Return the positions of the surface's points by the displacement of all nodes."""
         offsets = face_offsets(self._rest_angle + d[:, 2], self._thickness)
         return ((self._axis + d[:, :2])[:, None] + offsets).reshape(-1, 2)
 
+    def surface_arrival(self, x: np.ndarray | None, dt: float) -> np.ndarray:
+        """Return where its points are after a step of dt with the solution x (None: zero). Collective."""
+        return self._outline(self._everywhere(self._destination(x, dt)))
+
+    def surface_present(self) -> np.ndarray:
+        """Return the present positions of its points, shape (n_points, 2). Collective."""
+        return self._outline(self._everywhere(self.displacement))
+
+    def surface_shift(self) -> np.ndarray:
+        """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective."""
+        return self._at_points(self._shift())
+
     def surface_velocity(self) -> np.ndarray:
         """Return w of the step last accepted at the surface's points, shape (n_points, 2). Collective."""
+        return self._at_points(self._integrator.solved(self._motion()))
+
+    def _at_points(self, rates: np.ndarray) -> np.ndarray:
+        """Return by the present sections how points move if this rank's nodes move so. Collective."""
         self.surface()
-        w = self._everywhere(self._integrator.solved(self._motion()))
+        w = self._everywhere(rates)
         slopes = self._slopes.reshape(-1, 2, 2)
         return (w[:, None, :2] + slopes * w[:, 2, None, None]).reshape(-1, 2)
 

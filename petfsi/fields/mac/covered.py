@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
     "cell_kind", "face_kind", "openness", "narrow", "volume", "slivers", "extras", "index", "layout",
-    "block", "fluxes", "rhs", "bounds",
+    "block", "fluxes", "rhs",
 )  # fmt: skip
 
 
@@ -195,8 +195,6 @@ class CoveredGrid(FluidField):
             self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.slivers = found.slivers if self._moves else None
-        n_walls = len(facets) if seams is None else len(seams.walls)
-        self.bounds = found.walls.facet, found.walls.slot - self.layout.start, n_walls
         self.geometry_version += 1
         return found.walls, found.wet
 

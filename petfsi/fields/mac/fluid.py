@@ -188,6 +188,14 @@ class MacFluid(CoveredGrid):
         if self._assembled_for != (self.geometry_version, factor):
             self._assemble_block(factor)
         self.rhs[:] = -self._outflow(self.velocity_star)
+        if self.source is not None:
+            self.rhs += self.source
+
+    def inflow(self) -> np.ndarray | None:
+        """Return by unknown what jets let in, m^3/s (m^2/s in 2D); None if there are none. Not collective."""
+        if not self.surroundings.has_jets:
+            return None
+        return -self._outflow([np.zeros_like(v) for v in self.velocity_star])
 
     def rhs_round_off(self) -> float:
         """Return eps ||A v*||: net outflows are differences of what goes in and out. Collective."""

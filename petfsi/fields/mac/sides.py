@@ -109,6 +109,9 @@ class Surroundings:
     side_kind : list of ndarray of uint8
         Face arrays: OPEN or WALL for faces on the sides.
     jets : list of Jet
+        Those that this rank sees.
+    has_jets : bool
+        Whether any rank sees any.
     """
 
     def __init__(self, grid: MacGrid, sides: Sides):
@@ -117,7 +120,7 @@ class Surroundings:
         self.cell_kind[grid.inside(None)] = kinds.FLUID
         self.side_kind = [np.full(grid.shape(axis), kinds.WALL, dtype=np.uint8) for axis in range(grid.dim)]
         self.jets: list[Jet] = []
-        self._has_jets = any(isinstance(getattr(sides, name), InflowSide) for pair in NAMES for name in pair)
+        self.has_jets = any(isinstance(getattr(sides, name), InflowSide) for pair in NAMES for name in pair)
         for axis in range(grid.dim):
             for upper, name in enumerate(NAMES[axis]):
                 if not grid.periodic[axis]:
@@ -154,7 +157,7 @@ class Surroundings:
 
     def evaluate(self, time: float) -> None:
         """Evaluate all jets at a time. Collective."""
-        if self._has_jets:
+        if self.has_jets:
             agreed(self.grid.comm, lambda: self._evaluate_here(time))
 
     def _evaluate_here(self, time: float) -> None:

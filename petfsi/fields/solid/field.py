@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi.fields.base import Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.base import Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
@@ -19,11 +19,13 @@ from petfsi.fields.solid.lumped import LumpedEquation
 from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, distribute, slab
 from petfsi.fields.solid.pattern import Pattern
+from petfsi.fields.solid.shrinkage import Shrinkage
 from petfsi.fields.solid.spectrum import largest_eigenvalue
 from petfsi.fields.solid.supports import Elimination, Supports
+from petfsi.fields.solid.turning import Turning, bodies_of
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
-from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, relinearised, stable_step
+from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, relinearised, stable_step
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
@@ -96,6 +98,7 @@ class NodalSolid(SolidField):
         self.is_linear = self._elements.constant and not (self._loads is not None and self._loads.follow)
         self._set_exchange(mesh)
         self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
+        self._set_turning(mesh)
 
     @abstractmethod
     def _make_elements(self, solids: Mapping[str, Solid]) -> ElementLibrary:
@@ -104,6 +107,36 @@ class NodalSolid(SolidField):
     def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> LoadLibrary | None:
         """Return the loads of ``self._mesh``, or None if there are none. Collective."""
         return None
+
+    def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the simplices or segments of ``self._mesh`` that can turn without a force, and what resists shrinking.
+
+        Returns
+        -------
+        parts : ndarray of int, shape (ne, n)
+        body : ndarray of int, shape (ne,)
+        modulus : ndarray, shape (n_bodies,)
+            See ``Shrinkage``.
+        """
+        return np.zeros((0, 2), dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros(len(self.names))
+
+    def _set_turning(self, mesh: SimplexMesh) -> None:
+        """Make what has predictions turn, or watches what the middle of a rotation does. Collective."""
+        self._turning: Turning | None = None
+        self._shrinkage: Shrinkage | None = None
+        parts, body, modulus = self._turning_parts()
+        if self.explicit or not self.comm.allreduce(len(parts)):
+            return
+        mine = self._mesh.natural[: self._mesh.n_owned]
+        mass = np.stack([self._uniform[a][:, a] for a in range(self.dim)], axis=1)
+        if self._integrator.moment(1.0) < 1.0:
+            owner = self._node_body[mine]
+            self._shrinkage = Shrinkage(self.comm, self._mesh, parts, body, modulus, mass, owner)
+            return
+        held = np.zeros(self.layout.n_global, dtype=bool)
+        held[self._supports.still] = True
+        still = held[self.layout.start : self.layout.end].reshape(-1, self.width)[:, : self.dim]
+        self._turning = Turning(self.comm, self._mesh, parts, bodies_of(mesh)[mine], still, mass, self._with_shared)
 
     @abstractmethod
     def near_null_space(self) -> list[np.ndarray]:
@@ -189,7 +222,11 @@ class NodalSolid(SolidField):
 
     def predict(self, time: float, dt: float) -> None:
         """Take the geometry of the step: from here until ``accept`` the surface is where the tangent is taken."""
-        self._stage = self._integrator.stage(self._motion(), dt)
+        motion = self._motion()
+        self._stage = self._integrator.stage(motion, dt)
+        added = None if self._turning is None else self._integrator.turned(motion, dt, self._turning)
+        if added is not None:
+            self._stage = moved(self._stage, added)
         self._geometry = self._stage.tangent_at
 
     def assemble(self, time: float, dt: float) -> None:
@@ -336,6 +373,28 @@ class NodalSolid(SolidField):
         motion = self._motion()
         stage = self._stage or self._integrator.stage(motion, dt)
         return self._integrator.finish(motion, stage, x.reshape(-1, self.width).copy(), dt)
+
+    def remark(self, dt: float) -> str | None:
+        """Return which bodies turn too far in a step for the midpoint rule, each once. Collective."""
+        if self._shrinkage is None or not self._shrinkage.watches:
+            return None
+        both = self._with_shared(np.concatenate((self.displacement, self.velocity), axis=1))
+        d, u = both[:, : self.dim], both[:, self.width : self.width + self.dim]
+        return self._shrinkage.remark(self.names, d, u, dt)
+
+    def landing(self, dt: float) -> Landing:
+        """Return how a step of dt brings nodes to its end."""
+        scheme, stage = self._integrator, self._stage or self._integrator.stage(self._motion(), dt)
+        return Landing(scheme.moment(dt) == dt, scheme.stride(stage, dt), scheme.swings)
+
+    def _shift(self) -> np.ndarray:
+        """Return how far nodes are from where the fluid meets them to where w = 0 leads, shape (n_owned, width)."""
+        stage, met = self._stage, self._geometry
+        return np.zeros_like(self.velocity) if stage is None else stage.tangent_at + stage.shift - met
+
+    def _destination(self, x: np.ndarray | None, dt: float) -> np.ndarray:
+        """Return the displacement after a step of dt with the solution x (None: zero)."""
+        return self._arrival(np.zeros(self.layout.n_local) if x is None else x, dt).displacement
 
     def _motion(self) -> Motion:
         return Motion(self.displacement, self.velocity, self._past, self._past_dt)

@@ -47,7 +47,14 @@ class SimplexSolid(NodalSolid):
         self._must_not_invert = np.array([solid.material not in INVERTIBLE for solid in scene.solids.values()])
 
     def _make_elements(self, solids: Mapping[str, Solid]) -> Elements:
+        self._turns = np.array([solid.material != "linear" for solid in solids.values()])
         return Elements(self._mesh, _bodies(solids))
+
+    def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the cells of bodies whose material does not mind being turned, and 2 (lambda + mu)."""
+        use = self._turns[self._mesh.body]
+        bodies = self._elements.bodies
+        return self._mesh.cells[use], self._mesh.body[use], 2 * (bodies.lame + bodies.mu)
 
     def _make_loads(self, mesh: SimplexMesh, solids: Mapping[str, Solid]) -> Loads | None:
         if not any(solid.loads or solid.body_force for solid in solids.values()):
@@ -139,6 +146,18 @@ class SimplexSolid(NodalSolid):
         """Return where the surface's points are if this rank's nodes on it are at ``wet``. Collective."""
         nodes = self._gather_surface(wet)
         return nodes if self._surface.curved is None else self._surface.curved.vertices(nodes)
+
+    def surface_present(self) -> np.ndarray:
+        """Return the present positions of its points, shape (n_points, dim). Collective."""
+        return self._vertices(self.reference[self._wet] + self.displacement[self._wet])
+
+    def surface_shift(self) -> np.ndarray:
+        """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective."""
+        return self._gather_surface(self._shift()[self._wet])
+
+    def surface_arrival(self, x: np.ndarray | None, dt: float) -> np.ndarray:
+        """Return where its points are after a step of dt with the solution x (None: zero). Collective."""
+        return self._vertices(self.reference[self._wet] + self._destination(x, dt)[self._wet])
 
     def _gather_surface(self, wet: np.ndarray) -> np.ndarray:
         gathered = np.empty((self._surface.n_points, self.dim))

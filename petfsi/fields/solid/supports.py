@@ -85,6 +85,13 @@ class Supports:
         self.placed = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *(part[1] for part in self._placing)]))
 
     @property
+    def still(self) -> np.ndarray:
+        """Those of ``unknowns`` that are held at rest, where they were at the start."""
+        moving = [entries for _, entries, _ in self._moving]
+        moving += [entries for expression, entries, _ in self._placing if expression.depends_on_time]
+        return np.delete(self.unknowns, np.concatenate([np.zeros(0, dtype=np.int64), *moving]))
+
+    @property
     def move(self) -> bool:
         """Whether any of them moves."""
         return bool(self._moving) or any(expression.depends_on_time for expression, _, _ in self._placing)
