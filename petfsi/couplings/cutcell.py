@@ -14,13 +14,12 @@ from petfsi.couplings.enclosure import Enclosure
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
 from petfsi.geometry.seams import Seams
-from petfsi.geometry.slabs import to_lattice
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_triplets, row_sums, sum_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
-    from petfsi.fields.mac.cut import Walls, Wet
+    from petfsi.fields.mac.cut import Wet
     from petfsi.fields.mac.fluid import MacFluid
 
 
@@ -179,14 +178,12 @@ class CutCellCoupling(Coupling):
 
     def enclose(self, members: list[np.ndarray]) -> Enclosure | None:
         """Return what bounds regions of the fluid, each 1 on its unknowns and 0 elsewhere."""
-        grid = self.fluid.grid
-        assert self._positions is not None
-        # vertices at planes of the grid were moved a little
-        cut_at = grid.origin + grid.dx * to_lattice(self._positions, self.facets, grid.origin, grid.dx)
         assert self._seams is not None
         walls, start = self._seams.walls, self.fluid.layout.start
         curved = None if self.curved is None else self.curved.take(walls)
-        return Enclosure(cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved)
+        return Enclosure(
+            self.fluid.cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved
+        )
 
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the right sides. Collective."""

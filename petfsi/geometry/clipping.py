@@ -93,6 +93,8 @@ class CutCells:
         For every face of a split cell: its axis and flat index in ``open[axis]``, the pieces below and above (-1 in a
         cell that lies outside the box or the grid), the part of the face that is open between them. A face's links
         add up to its open fraction.
+    points : ndarray, shape (n, dim)
+        Where the surface was cut: its points, moved a little from planes of the grid and where bodies touch, m.
     """
 
     facet: np.ndarray
@@ -111,6 +113,7 @@ class CutCells:
     link_below: np.ndarray
     link_above: np.ndarray
     link_open: np.ndarray
+    points: np.ndarray
 
 
 def cut(
@@ -200,6 +203,7 @@ def cut(
         link_below=pieces.link_below,
         link_above=pieces.link_above,
         link_open=pieces.link_open,
+        points=np.asarray(lattice.origin) + dx * x,
     )
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
     "cell_kind", "face_kind", "openness", "narrow", "volume", "slivers", "extras", "index", "layout",
-    "block", "fluxes", "rhs",
+    "block", "fluxes", "rhs", "cut_at",
 )  # fmt: skip
 
 
@@ -56,6 +56,8 @@ class CoveredGrid(FluidField):
         Further unknowns, of cells that hold several pieces of fluid.
     slivers : Slivers or None
         None where nothing that cuts cells can move.
+    cut_at : ndarray, shape (n, dim)
+        Where the points of the surface were when it was last cut, m.
     flux_rows : (ndarray, ndarray, ndarray)
         This rank's rows of L as last assembled, SI: indptr, global columns, values.
     volume : ndarray or None
@@ -92,6 +94,7 @@ class CoveredGrid(FluidField):
         self.geometry_version = self.kinds_version = 0
         self._regions: tuple[int, Regions] | None = None
         self.slivers: Slivers | None = None
+        self.cut_at = np.zeros((0, self.dim))
         self._moves = self._cutter is not None and bool(scene.solids)
         self._new_blocks()
         self._pattern = pressure.Pattern(grid)
@@ -195,6 +198,7 @@ class CoveredGrid(FluidField):
             self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.slivers = found.slivers if self._moves else None
+        self.cut_at = found.points
         self.geometry_version += 1
         return found.walls, found.wet
 

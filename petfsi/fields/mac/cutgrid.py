@@ -46,6 +46,8 @@ class Openings:
         About the upper corner of the grid.
     slivers : Slivers
         Of this rank's unknowns that are solved, by their local numbers.
+    points : ndarray, shape (n, dim)
+        Where the surface was cut, see ``clipping.CutCells``.
     """
 
     cell_kind: np.ndarray
@@ -59,6 +61,7 @@ class Openings:
     walls: Walls
     wet: Wet
     slivers: Slivers
+    points: np.ndarray
 
 
 class CutGrid:
@@ -147,7 +150,20 @@ class CutGrid:
         patches = np.flatnonzero(solved[slot] & (found.facet < n_moving))
         wet = first_moments(found, patches, self._centres(found.cell[patches]))
         narrow = self._narrow(whole, face_kind)
-        return Openings(cell_kind, face_kind, openness, narrow, volume, layout, index, extras, walls, wet, slivers)
+        return Openings(
+            cell_kind,
+            face_kind,
+            openness,
+            narrow,
+            volume,
+            layout,
+            index,
+            extras,
+            walls,
+            wet,
+            slivers,
+            found.points[:n_points],
+        )
 
     def _whole_openings(self, found: CutCells) -> list[np.ndarray]:
         """Return the open fractions of local faces by axis, split or not. Collective."""
