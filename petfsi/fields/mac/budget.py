@@ -16,12 +16,10 @@ from numba import njit
 
 from petfsi.fields.base import Stock
 from petfsi.fields.mac.extras import Extras
+from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid
 from petfsi.fields.mac.kinds import OPEN, PRESSURE, STEP, WALL
 from petfsi.fields.mac.weight import Weight
-
-#: An array of faces per axis.
-Faces = list[np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -33,22 +31,36 @@ class Forces:
     plain, lift : ndarray, shape (dim,)
     smoke : ndarray or None
         Cell array; None if there is no lift.
+    link_smoke : ndarray or None
+        That at the links of divided faces.
     """
 
     plain: np.ndarray
     lift: np.ndarray
     smoke: np.ndarray | None
+    link_smoke: np.ndarray | None
 
     @classmethod
-    def of(cls, gravity: np.ndarray, heavy: list[bool], buoyancy: float, smoke: np.ndarray | None) -> Forces | None:
+    def of(
+        cls, gravity: np.ndarray, heavy: list[bool], buoyancy: float, smoke: np.ndarray | None,
+        link_smoke: np.ndarray | None,
+    ) -> Forces | None:  # fmt: skip
         """Return gravity (along axes where the fluid is ``heavy``) and buoyancy, or None if there is neither."""
         plain, lift = np.where(heavy[: len(gravity)], gravity, 0.0), -buoyancy * gravity
         if not np.any(plain) and not np.any(lift):
             return None
-        return cls(plain, lift, smoke if np.any(lift) else None)
+        return cls(plain, lift, smoke, link_smoke) if np.any(lift) else cls(plain, lift, None, None)
+
+    def on_links(self, axis: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Return the acceleration of some links of divided faces, given their axes and rows, m/s^2."""
+        plain = self.plain[axis]
+        return plain if self.link_smoke is None else plain + self.lift[axis] * self.link_smoke[row]
 
 
-def stock(grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness: Faces, extras: Extras | None) -> Stock:
+def stock(
+    grid: MacGrid, density: float, velocity: Faces, kind: list[np.ndarray], openness: list[np.ndarray],
+    extras: Extras | None,
+) -> Stock:  # fmt: skip
     """Return this rank's share of momentum and kinetic energy. Not collective."""
     mass = density * grid.cell_volume
     momentum, squares = np.zeros(grid.dim), 0.0
@@ -57,29 +69,31 @@ def stock(grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness:
         momentum[a] = mass * first
         squares += second
     if extras is not None:
-        # of a split face the mean velocity of its parts is known
-        v = extras.at_faces(velocity)
-        part = np.where((extras.below < 0) | (extras.above < 0), 0.5, 1.0) * extras.openness
-        part = np.where(_owned(grid, extras), part, 0.0)
+        v, part = velocity.parts[extras.row], _shares(extras)
         momentum += mass * np.bincount(extras.axis, part * v, minlength=grid.dim)
         squares += float(part @ v**2)
     return Stock(momentum, 0.5 * mass * squares)
 
 
-def power(grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness: Faces, forces: Forces) -> float:
-    """Return this rank's share of the power of forces, W; split faces are left out. Not collective."""
+def power(
+    grid: MacGrid, density: float, velocity: Faces, kind: list[np.ndarray], openness: list[np.ndarray],
+    extras: Extras | None, forces: Forces,
+) -> float:  # fmt: skip
+    """Return this rank's share of the power of forces, W. Not collective."""
     total = 0.0
     for a, v in enumerate(velocity):
         if forces.plain[a] != 0.0:
             total += forces.plain[a] * _moments(kind[a], openness[a], v, _part(grid, a))[0]
         if forces.smoke is not None and forces.lift[a] != 0.0:
             total += forces.lift[a] * _carried(kind[a], openness[a], v, forces.smoke, STEP[a], _part(grid, a))
+    if extras is not None:
+        total += float((_shares(extras) * velocity.parts[extras.row]) @ forces.on_links(extras.axis, extras.row))
     return density * grid.cell_volume * total
 
 
 def inflow(
-    grid: MacGrid, density: float, velocity: Faces, kind: Faces, openness: Faces, pressure: np.ndarray,
-    active: np.ndarray, weight: Weight | None,
+    grid: MacGrid, density: float, velocity: Faces, kind: list[np.ndarray], openness: list[np.ndarray],
+    pressure: np.ndarray, active: np.ndarray, weight: Weight | None,
 ) -> float:  # fmt: skip
     """Return this rank's share of the power that comes through the sides, W. Not collective.
 
@@ -126,15 +140,10 @@ def _along(velocity: Faces, cell: tuple[slice, ...], axis: int) -> np.ndarray:
     return total
 
 
-def _owned(grid: MacGrid, extras: Extras) -> np.ndarray:
-    """Return which links' faces are this rank's own."""
-    own = np.zeros(len(extras.axis), dtype=bool)
-    for a in range(grid.dim):
-        at = np.flatnonzero(extras.axis == a)
-        index = np.unravel_index(extras.face[at], grid.shape(a))
-        part = grid.owned(a)
-        own[at] = np.all([(i >= s.start) & (i < s.stop) for i, s in zip(index, part, strict=True)], axis=0)
-    return own
+def _shares(extras: Extras) -> np.ndarray:
+    """Return the part of a whole cell's mass that each link of this rank's own faces has; zero for others."""
+    share = np.where((extras.below < 0) | (extras.above < 0), 0.5, 1.0) * extras.openness
+    return np.where(extras.owned, share, 0.0)
 
 
 def _part(grid: MacGrid, axis: int) -> tuple[tuple[int, int], ...]:

@@ -12,6 +12,7 @@ from petfsi.fields.base import FluidField
 from petfsi.fields.mac import kinds, pressure
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.parts import Parts
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, periodic_axes
 from petfsi.fields.mac.slivers import outer_products
@@ -180,6 +181,7 @@ class CoveredGrid(FluidField):
             Where the surface reaches around periodic axes. In the answer facets are numbered among its walls.
         """
         assert self._cutter is not None
+        old_kind = self.face_kind
         found = self._cutter.cut(points, facets, part, seams)
         changed = any(
             not np.array_equal(new, old)
@@ -199,6 +201,7 @@ class CoveredGrid(FluidField):
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.slivers = found.slivers if self._moves else None
         self.cut_at = found.points
+        self._divide(found.parts, old_kind)
         self.geometry_version += 1
         return found.walls, found.wet
 
@@ -268,6 +271,9 @@ class CoveredGrid(FluidField):
 
     def _reach_changed(self) -> None:
         """Refresh what follows from where the flow can be read. Collective."""
+
+    def _divide(self, parts: Parts, old_kind: list[np.ndarray]) -> None:
+        """Take over what divided cells and faces consist of; faces had other kinds before. Collective."""
 
     def _assemble_block(self, factor: float) -> None:
         """Fill L, and L + L T L, for the step's factor (see ``transport``). Collective."""

@@ -12,6 +12,7 @@ from petfsi.fields.mac import kinds
 from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, links_of, patch_slots, walls_of
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.parts import Parts, global_index, owned
 from petfsi.fields.mac.sides import Surroundings
 from petfsi.fields.mac.slivers import Slivers, slivers_of
 from petfsi.geometry.clipping import CutCells, Lattice, cut
@@ -40,6 +41,8 @@ class Openings:
         Cell array of the unknowns' global numbers.
     extras : Extras or None
         None if no rank has any split cell.
+    parts : Parts
+        What split cells and their faces consist of.
     walls : Walls
         Slots are global numbers of unknowns; entries of unknowns that are not solved are left out.
     wet : Wet
@@ -58,6 +61,7 @@ class Openings:
     layout: Layout
     index: np.ndarray
     extras: Extras | None
+    parts: Parts
     walls: Walls
     wet: Wet
     slivers: Slivers
@@ -139,7 +143,7 @@ class CutGrid:
         self._part(volume, None)[...] = found.volume
         grid.exchange_cells(volume)
         cell_kind, face_kind = self._kinds(openness, split)
-        layout, index, extras, numbers = self._number(found, links)
+        layout, index, extras, parts, numbers = self._number(found, links)
         active = cell_kind.reshape(-1)[self._flat] == kinds.FLUID
         solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
@@ -159,6 +163,7 @@ class CutGrid:
             layout,
             index,
             extras,
+            parts,
             walls,
             wet,
             slivers,
@@ -230,11 +235,11 @@ class CutGrid:
             found.append(narrow)
         return found
 
-    def _number(self, found: CutCells, links: Links) -> tuple[Layout, np.ndarray, Extras | None, np.ndarray]:
-        """Return layout, cell numbers, extras, and the global number of each slot. Collective."""
+    def _number(self, found: CutCells, links: Links) -> tuple[Layout, np.ndarray, Extras | None, Parts, np.ndarray]:
+        """Return layout, cell numbers, extras, parts, and the global number of each slot. Collective."""
         grid = self.grid
         if not grid.comm.allreduce(bool(len(found.extra_cell) or links.split.any()), op=MPI.LOR):
-            return grid.layout, grid.index, None, grid.index.reshape(-1)[self._flat]
+            return grid.layout, grid.index, None, Parts.none(), grid.index.reshape(-1)[self._flat]
         local = self._flat[found.extra_cell]
         mine = np.flatnonzero(self._own[found.extra_cell])
         layout = Layout.of(grid.comm, grid.layout.n_local + len(mine))
@@ -249,22 +254,49 @@ class CutGrid:
         extra = every[order[np.searchsorted(keys[order], key)]]
         numbers = np.concatenate((index.reshape(-1)[self._flat].astype(np.int64), extra))
         pieces = local[mine], found.extra_piece[mine], found.extra_volume[mine]
-        return layout, index, Extras(*pieces, *self._split_links(links, numbers, found.extra_cell)), numbers
+        parts, columns = self._split_links(found, links, numbers)
+        return layout, index, Extras(*pieces, *columns), parts, numbers
 
-    def _split_links(self, links: Links, numbers: np.ndarray, extra_cell: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return what ``Extras`` says of links, in an order that does not depend on how they were found."""
+    def _split_links(self, found: CutCells, links: Links, numbers: np.ndarray) -> tuple[Parts, tuple[np.ndarray, ...]]:
+        """Return all ranks' parts, and what ``Extras`` says of links, in the same order on any ranks. Collective."""
+        grid = self.grid
         torn = np.flatnonzero(links.split)
-        own = np.concatenate((self._own, self._own[extra_cell]))
+        own = np.concatenate((self._own, self._own[found.extra_cell]))
+        piece = np.concatenate((np.zeros(len(self._own), dtype=np.int64), found.extra_piece))
         ends = links.below[torn], links.above[torn]
         below, above = (np.where(slot >= 0, numbers[slot], -1) for slot in ends)
+        names = [np.where(slot >= 0, piece[slot], -1) for slot in ends]
         mine_below, mine_above = ((slot >= 0) & own[slot] for slot in ends)
-        axis, face = links.axis[torn], np.empty(len(torn), dtype=np.int64)
+        axis, face, opening = links.axis[torn], np.empty(len(torn), dtype=np.int64), links.openness[torn]
+        natural, is_owned = np.empty(len(torn), dtype=np.int64), np.zeros(len(torn), dtype=bool)
         for a, faces in enumerate(self._flat_faces):
-            face[axis == a] = faces[links.face[torn[axis == a]]]
-        use = np.flatnonzero(mine_below | mine_above)
-        order = use[np.lexsort((above[use], below[use], face[use], axis[use]))]
-        columns = (axis, face, below, above, mine_below, mine_above, links.openness[torn])
-        return tuple(column[order] for column in columns)
+            here = axis == a
+            face[here] = faces[links.face[torn[here]]]
+        use = mine_below | mine_above
+        for a in range(grid.dim):
+            here = np.flatnonzero((axis == a) & use)
+            natural[here], is_owned[here] = global_index(grid, a, face[here]), owned(grid, a, face[here])
+        table = np.column_stack((axis, natural, *names, opening))[use & is_owned]
+        parts = Parts.gathered(grid, self._split_pieces(found), table, self._split_walls(found))
+        use = np.flatnonzero(use)
+        row = parts.rows(axis[use], natural[use], names[0][use], names[1][use])
+        order = use[np.argsort(row, kind="stable")]
+        columns = (axis, face, below, above, mine_below, mine_above, opening)
+        return parts, (*(column[order] for column in columns), np.sort(row), is_owned[order])
+
+    def _split_pieces(self, found: CutCells) -> np.ndarray:
+        """Return cell, piece and volume of this rank's further pieces, shape (n, 3)."""
+        mine = np.flatnonzero(self._own[found.extra_cell])
+        cell = global_index(self.grid, None, self._flat[found.extra_cell[mine]])
+        return np.column_stack((cell, found.extra_piece[mine], found.extra_volume[mine]))
+
+    def _split_walls(self, found: CutCells) -> np.ndarray:
+        """Return cell, piece, facet and area of the walls of this rank's split cells, shape (n, 4)."""
+        split = np.zeros(len(self._own), dtype=bool)
+        split[found.extra_cell] = True
+        mine = np.flatnonzero((split & self._own)[found.cell])
+        cell = global_index(self.grid, None, self._flat[found.cell[mine]])
+        return np.column_stack((cell, found.piece[mine], found.facet[mine], found.integrals[mine].sum(axis=1)))
 
 
 @njit(cache=True)

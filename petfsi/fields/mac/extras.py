@@ -33,6 +33,10 @@ class Extras:
         Whether that unknown is this rank's, and not just its image in a ghost.
     openness : ndarray, shape (n_links,)
         That of the part: a fraction of the face.
+    row : ndarray of int, shape (n_links,)
+        Where ``parts.Parts`` has the link.
+    owned : ndarray of bool, shape (n_links,)
+        Whether the face is this rank's own.
     """
 
     cell: np.ndarray
@@ -45,6 +49,8 @@ class Extras:
     mine_below: np.ndarray
     mine_above: np.ndarray
     openness: np.ndarray
+    row: np.ndarray
+    owned: np.ndarray
 
     def same(self, other: Extras | None) -> bool:
         """Return whether unknowns and links are those of another one, whatever their openness."""
@@ -110,31 +116,22 @@ class Extras:
         total.sort_indices()
         return total.indptr.astype(IntType), total.indices.astype(IntType), total.data
 
-    def add_inflow(self, star: list[np.ndarray], areas: np.ndarray, layout: Layout, out: np.ndarray) -> None:
-        """Add minus the net outflow through the links to this rank's right-hand side."""
-        v = self.at_faces(star)
-        flux = areas[self.axis] * self.openness * v
+    def add_inflow(self, star: np.ndarray, areas: np.ndarray, layout: Layout, out: np.ndarray) -> None:
+        """Add minus the net outflow through the links, by their velocities, to this rank's right-hand side."""
+        flux = areas[self.axis] * self.openness * star[self.row]
         for number, mine, sign in ((self.below, self.mine_below, -1.0), (self.above, self.mine_above, 1.0)):
             np.add.at(out, number[mine] - layout.start, sign * flux[mine])
 
-    def at_faces(self, arrays: list[np.ndarray]) -> np.ndarray:
-        """Return a face quantity at each link."""
-        values = np.zeros(len(self.axis))
-        for a, array in enumerate(arrays):
-            at = self.axis == a
-            values[at] = array.reshape(-1)[self.face[at]]
-        return values
-
     def project(
-        self, star: list[np.ndarray], p: np.ndarray, start: int, pressure: np.ndarray, index: np.ndarray,
-        factor: np.ndarray, out: list[np.ndarray], comm: MPI.Comm,
-    ) -> None:  # fmt: skip
-        """Write the velocity of this rank's split faces: the mean over their parts. Collective.
+        self, star: np.ndarray, p: np.ndarray, start: int, pressure: np.ndarray, index: np.ndarray,
+        factor: np.ndarray, comm: MPI.Comm,
+    ) -> np.ndarray:  # fmt: skip
+        """Return the velocity of all links, right where the face is this rank's own. Collective.
 
         Parameters
         ----------
-        star, out : list of ndarray
-            Face arrays before and after.
+        star : ndarray
+            That of all links before.
         p : ndarray
             This rank's extra pressures, whose first has the global number ``start``.
         pressure, index : ndarray
@@ -148,9 +145,10 @@ class Extras:
         ends = []
         for number, step in ((self.below, -1), (self.above, 0)):
             value = np.zeros(len(number))
-            for a, array in enumerate(out):
+            for a in range(len(factor)):
                 at = np.flatnonzero((self.axis == a) & (number >= 0))
-                where = list(np.unravel_index(self.face[at], array.shape))
+                shape = tuple(n + (b == a) for b, n in enumerate(pressure.shape))
+                where = list(np.unravel_index(self.face[at], shape))
                 where[a] = where[a] + step
                 own = index[tuple(where)] == number[at]
                 value[at] = pressure[tuple(where)]
@@ -158,11 +156,6 @@ class Extras:
                 value[far] = every[np.searchsorted(numbers, number[far])]
             ends.append(value)
         gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
-        v = self.at_faces(star) - gain * factor[self.axis] * (ends[1] - ends[0])
-        for a, array in enumerate(out):
-            at = self.axis == a
-            flat = array.reshape(-1)
-            weight = np.bincount(self.face[at], self.openness[at], minlength=flat.size)
-            total = np.bincount(self.face[at], self.openness[at] * v[at], minlength=flat.size)
-            faces = np.unique(self.face[at])
-            flat[faces] = total[faces] / weight[faces]
+        out = star.copy()
+        out[self.row] -= gain * factor[self.axis] * (ends[1] - ends[0])
+        return out

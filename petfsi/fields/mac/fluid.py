@@ -11,6 +11,10 @@ from petfsi.fields.base import Reader, Slab, Stock, Work, scalar_slab
 from petfsi.fields.mac import advect, budget, kinds, pressure, views
 from petfsi.fields.mac.covered import CoveredGrid
 from petfsi.fields.mac.extrapolate import FAR, Band
+from petfsi.fields.mac.faces import Faces, each
+from petfsi.fields.mac.lineage import Lineage
+from petfsi.fields.mac.parts import Parts, read_whole, whole_slab
+from petfsi.fields.mac.sheets import Sheets
 from petfsi.fields.mac.sides import evaluate_at, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
@@ -34,13 +38,18 @@ class MacFluid(CoveredGrid):
     ----------
     grid : MacGrid
     density : float
-    velocity, velocity_star, boundary_velocity : list of ndarray
+    velocity, velocity_star : Faces
+    boundary_velocity : list of ndarray
         Face arrays per axis. Boundary velocities are those of WALL faces and, written by a coupling before
         ``accept``, of SOLID_FACE ones, ghosts included.
     pressure : ndarray
         Cell array, Pa; zero where it is not solved.
     smoke : ndarray or None
         Cell array.
+    smoke_parts : ndarray
+        That of the further pieces of divided cells, on every rank.
+    sheets : Sheets or None
+        Divided cells and faces; None where nothing cuts cells.
     """
 
     name = "pressure"
@@ -50,11 +59,13 @@ class MacFluid(CoveredGrid):
         assert scene.fluid is not None
         grid, fluid = self.grid, scene.fluid
         self._transport = TRANSPORTS[scene.time.integrator](Advection(grid, self.surroundings, fluid.advection))
-        self.velocity = [grid.zeros_faces(axis) for axis in self._axes]
-        self.velocity_star = [grid.zeros_faces(axis) for axis in self._axes]
+        self.velocity = Faces(grid.zeros_faces(axis) for axis in self._axes)
+        self.velocity_star = Faces(grid.zeros_faces(axis) for axis in self._axes)
         self.boundary_velocity = [grid.zeros_faces(axis) for axis in self._axes]
         self.pressure = grid.zeros_cells()
         self.smoke = None if fluid.smoke is None else grid.zeros_cells()
+        self.smoke_parts = np.zeros(0)
+        self.sheets: Sheets | None = None
         self._extra_pressure = np.zeros(0)
         self._other_pressure: np.ndarray | None = None
         self._forces: budget.Forces | None = None
@@ -87,6 +98,10 @@ class MacFluid(CoveredGrid):
             self.smoke[self.cell_kind != kinds.FLUID] = 0.0
             self._complete_cells(self.smoke)
         self._transport.carried = self._extend(self.velocity)
+        if self.sheets is not None:
+            assert self.narrow is not None
+            whole = Sheets(self.grid, Parts.none(), self.face_kind, self.narrow, self.cell_kind)
+            self._go_on(Lineage(self.grid, whole, self.sheets, self.face_kind))
 
     def _evaluate(self, text: Number, key: str, array: np.ndarray, axis: int | None) -> None:
         """Fill the owned part of a local array with the values of an expression at time zero. Collective."""
@@ -121,6 +136,29 @@ class MacFluid(CoveredGrid):
             for band, kind in zip(self._bands, self.face_kind, strict=True)
         ]
 
+    def _divide(self, parts: Parts, old_kind: list[np.ndarray]) -> None:
+        """Let divided faces and cells go on with what those had that they come from. Collective."""
+        old, grid = self.sheets, self.grid
+        assert self.narrow is not None
+        self.sheets = Sheets(grid, parts, self.face_kind, self.narrow, self.cell_kind)
+        self._transport.advection.sheets = self.sheets
+        if old is not None and (len(parts) or len(old.table)):
+            self._go_on(Lineage(grid, old, self.sheets, old_kind))
+
+    def _go_on(self, lineage: Lineage) -> None:
+        """Take over velocities and smoke of the former parts. Collective."""
+        self.velocity, self.velocity_star = lineage.faces(self.velocity), lineage.faces(self.velocity_star)
+        self._transport.change(lineage.faces)
+        if self.smoke is not None:
+            assert self.volume is not None
+            self.smoke, self.smoke_parts = lineage.smoke(self.smoke, self.smoke_parts, self.volume)
+
+    def rewind(self) -> None:
+        """Put everything back to before the step. Collective."""
+        super().rewind()
+        self._transport.rewind()
+        self._transport.advection.sheets = self.sheets
+
     def unknown(self) -> np.ndarray:
         """Return the pressure of this rank's cells and of its extra unknowns, Pa, in PETSc's order.
 
@@ -139,31 +177,40 @@ class MacFluid(CoveredGrid):
 
     def predict(self, time: float, dt: float) -> None:
         """Carry velocity and smoke along, add gravity and buoyancy, open the jets: ``velocity_star``. Collective."""
-        self._remember("smoke", "_extra_pressure")
+        self._remember("smoke", "_extra_pressure", "velocity", "smoke_parts", "sheets")
         transport = self._transport
+        transport.remember()
         transport.predict(self._moved, dt, self.velocity_star, self._extend)
-        moment, smoke = transport.moment(dt), self.smoke
+        moment, smoke, further = transport.moment(dt), self.smoke, self.smoke_parts
         if self.smoke is not None and self._smoke_band is not None:
-            old = self.smoke
-            self.smoke = transport.carry_smoke(old, self._smoke_band.layer != FAR, dt)
+            old, parts = self.smoke, self.smoke_parts
+            self.smoke, self.smoke_parts = transport.carry_smoke(old, parts, self._smoke_band.layer != FAR, dt)
             self._complete_cells(self.smoke)
             smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
+            further = self.smoke_parts if moment == dt else parts + moment / dt * (self.smoke_parts - parts)
         self.surroundings.evaluate(time + moment)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
-        self._add_forces(time + moment, transport.factor(dt), smoke)
+        self._add_forces(time + moment, transport.factor(dt), smoke, further)
 
-    def _add_forces(self, time: float, duration: float, smoke: np.ndarray | None) -> None:
+    def _add_forces(self, time: float, duration: float, smoke: np.ndarray | None, further: np.ndarray) -> None:
         """Accelerate ``velocity_star`` as at ``time`` for ``duration`` and set it on WALL faces. Collective."""
         buoyancy = 0.0
         if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
             buoyancy = self.scene.fluid.smoke.buoyancy
         gravity = np.array([float(g(t=time)) for g in self._gravity])
-        self._forces = budget.Forces.of(
-            gravity, [self.weight is None or p for p in self.grid.periodic], buoyancy, smoke
-        )
+        local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
+        link_smoke = None if smoke is None or local is None else local.at_cells(smoke, further)
+        heavy = [self.weight is None or p for p in self.grid.periodic]
+        self._forces = forces = budget.Forces.of(gravity, heavy, buoyancy, smoke, link_smoke)
+        before = None if local is None else local.at_faces(self.velocity_star)
         if self.weight is not None:
             self.weight.at(time)
             self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
+        if local is not None and before is not None:
+            pushed = local.gathered(local.at_faces(self.velocity_star) - before, local.link)
+            if forces is not None:
+                pushed = pushed + duration * forces.on_links(local.table.axis, np.arange(len(pushed)))
+            self.velocity_star.parts = self.velocity_star.parts + pushed
         for axis in self._axes:
             star, kind = self.velocity_star[axis], self.face_kind[axis]
             dv = duration * gravity[axis]
@@ -195,7 +242,7 @@ class MacFluid(CoveredGrid):
         """Return by unknown what jets let in, m^3/s (m^2/s in 2D); None if there are none. Not collective."""
         if not self.surroundings.has_jets:
             return None
-        return -self._outflow([np.zeros_like(v) for v in self.velocity_star])
+        return -self._outflow(each(np.zeros_like, self.velocity_star))
 
     def rhs_round_off(self) -> float:
         """Return eps ||A v*||: net outflows are differences of what goes in and out. Collective."""
@@ -216,7 +263,7 @@ class MacFluid(CoveredGrid):
         n_cells = grid.layout.n_local
         grid.from_vec(x[:n_cells], self.pressure)
         grid.exchange_cells(self.pressure)
-        solved = [np.zeros_like(v) for v in self.velocity]
+        solved = Faces(np.zeros_like(v) for v in self.velocity)
         for axis in self._axes:
             pressure.project(
                 self.velocity_star[axis],
@@ -230,10 +277,14 @@ class MacFluid(CoveredGrid):
             )
         if self.extras is not None:
             self._extra_pressure = x[n_cells:].copy()
-            self.extras.project(
-                self.velocity_star, self._extra_pressure, self.layout.start + n_cells, self.pressure, self.index,
-                factor / (self.density * grid.dx), solved, self.comm,
+            assert self.sheets is not None
+            local, extras = self.sheets.local, self.extras
+            parts = extras.project(
+                self.velocity_star.parts, self._extra_pressure, self.layout.start + n_cells, self.pressure,
+                self.index, factor / (self.density * grid.dx), self.comm,
             )  # fmt: skip
+            solved.parts = local.gathered(parts, extras.row[extras.owned])
+            local.mean_into(solved, solved.parts)
         if self.weight is not None:
             rest = self.weight.pressure()
             self.pressure += np.where(self._active, rest, 0.0)
@@ -252,7 +303,7 @@ class MacFluid(CoveredGrid):
             second = self.extras.piece == 1
             self._other_pressure.reshape(-1)[self.extras.cell[second]] = self._extra_pressure[second]
 
-    def _extend(self, faces: list[np.ndarray]) -> list[np.ndarray]:
+    def _extend(self, faces: Faces) -> Faces:
         """Fill ghosts, bands and what lies beyond the sides; return copies that narrow faces are not read from.
 
         Without any such faces the arrays themselves are returned. Collective.
@@ -268,7 +319,7 @@ class MacFluid(CoveredGrid):
                 self.grid.fill_sides(v, axis)
             self.grid.fill_sides(known, axis)
             extended.append(known)
-        return extended
+        return Faces(extended, faces.parts)
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
         assert self._smoke_band is not None
@@ -281,6 +332,7 @@ class MacFluid(CoveredGrid):
     def cfl(self, dt: float) -> float:
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
         most = max(advect.largest(v) * dt / h for v, h in zip(self.velocity, self.grid.dx, strict=True))
+        most = max(most, advect.largest(self.velocity.parts) * dt / float(self.grid.dx.min()))
         return self.comm.allreduce(most, op=MPI.MAX)
 
     def stock(self) -> Stock:
@@ -298,7 +350,7 @@ class MacFluid(CoveredGrid):
         kinetic = 0.5 * float(pushed @ flow)
         return Stock(stock.momentum + pushed @ self.slivers.normal, stock.kinetic + kinetic)
 
-    def _outflow(self, velocity: list[np.ndarray]) -> np.ndarray:
+    def _outflow(self, velocity: Faces) -> np.ndarray:
         """Return the net outflow of each of this rank's unknowns through its faces, m^3/s (m^2/s in 2D)."""
         inflow = np.zeros(self.layout.n_local)
         areas = np.array([self.grid.face_area(axis) for axis in self._axes])
@@ -308,10 +360,10 @@ class MacFluid(CoveredGrid):
                 kinds.STEP[axis], areas[axis], self._part(None), inflow,
             )  # fmt: skip
         if self.extras is not None:
-            self.extras.add_inflow(velocity, areas, self.layout, inflow)
+            self.extras.add_inflow(velocity.parts, areas, self.layout, inflow)
         return -inflow
 
-    def _outflow_of(self, unknowns: np.ndarray, velocity: list[np.ndarray]) -> np.ndarray:
+    def _outflow_of(self, unknowns: np.ndarray, velocity: Faces) -> np.ndarray:
         """Return the same for some unknowns, by their local numbers."""
         inflow = np.zeros(self.layout.n_local)
         areas = np.array([self.grid.face_area(axis) for axis in self._axes])
@@ -324,7 +376,7 @@ class MacFluid(CoveredGrid):
             )  # fmt: skip
         inflow[cells] = through
         if self.extras is not None:
-            self.extras.add_inflow(velocity, areas, self.layout, inflow)
+            self.extras.add_inflow(velocity.parts, areas, self.layout, inflow)
         return -inflow[unknowns]
 
     def work(self, dt: float) -> Work:
@@ -332,7 +384,7 @@ class MacFluid(CoveredGrid):
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
         gravity = 0.0
         if self._forces is not None:
-            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self._forces)
+            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self.extras, self._forces)
         into = budget.inflow(
             self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight
         )  # fmt: skip
@@ -379,12 +431,34 @@ class MacFluid(CoveredGrid):
         """Return velocity, kinds, pressure, smoke and the transport's past: all that the next step reads."""
         stored = [*self._stored(), *self._stored_reach(), *self._stored_past()]
         arrays = {name: self.grid.slab(array, axis) for name, array, axis in stored}
-        return arrays | ({"past_dt": scalar_slab(self.comm, self._transport.past_dt)} if self._transport.past else {})
+        arrays |= {"past_dt": scalar_slab(self.comm, self._transport.past_dt)} if self._transport.past else {}
+        return arrays if self.sheets is None else arrays | self._parts_state(self.sheets.table)
+
+    def _parts_state(self, table: Parts) -> dict[str, Slab]:
+        """Return divided cells and faces, and what is on them."""
+        rank = self.comm.rank
+        values = {f"parts_{name}": whole_slab(rank, array) for name, array in self._on_parts().items()}
+        return table.state(rank) | values
+
+    def _on_parts(self) -> dict[str, np.ndarray]:
+        past = {name: faces.parts for name, faces in self._transport.past.items()}
+        return {"velocity_links": self.velocity.parts, "smoke_pieces": self.smoke_parts, **past}
+
+    def _restore_parts(self, read: Reader) -> None:
+        """Take back divided cells and faces, and what is on them; kinds are back already. Collective."""
+        assert self.narrow is not None
+        self.sheets = Sheets(self.grid, Parts.restored(read), self.face_kind, self.narrow, self.cell_kind)
+        self._transport.advection.sheets = self.sheets
+        stored = {name: read_whole(read, f"parts_{name}") for name in self._on_parts()}
+        self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
+        self._transport.carried.parts = self.velocity.parts
+        for name, parts in stored.items():
+            self._transport.past[name].parts = parts
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
         transport = self._transport
-        transport.carried = self.velocity if self.narrow is None else [v.copy() for v in self.velocity]
+        transport.carried = self.velocity if self.narrow is None else each(np.copy, self.velocity)
         for name, array, axis in [*self._stored(), *self._stored_reach(), *self._stored_past()]:
             self.grid.read_slab(read, name, array, axis)
             self.grid.halo.exchange(array, axis)
@@ -395,6 +469,8 @@ class MacFluid(CoveredGrid):
                 self.grid.fill_sides(arrays[axis], axis)
         self.geometry_version += 1
         self._kinds_changed()
+        if self.sheets is not None:
+            self._restore_parts(read)
         if self.smoke is not None:
             self._complete_cells(self.smoke)
 

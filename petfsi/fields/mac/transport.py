@@ -17,7 +17,9 @@ from mpi4py import MPI
 
 from petfsi.errors import SolveError
 from petfsi.fields.mac import advect, kinds
+from petfsi.fields.mac.faces import Faces, each
 from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.sheets import Sheets
 from petfsi.fields.mac.sides import Surroundings
 from petfsi.integrators import Bdf2, Midpoint, Newmark
 
@@ -26,8 +28,6 @@ MAX_COURANT = {"linear": 4.0, "cubic": 3.0}
 #: Times that it may cross the whole grid in one step; more is no flow any longer.
 MAX_CROSSINGS = 10
 
-#: An array of faces per axis.
-Faces = list[np.ndarray]
 #: Fills ghosts, and faces without a velocity of their own; returns what is to be read of the arrays. Collective.
 Extend = Callable[[Faces], Faces]
 
@@ -38,16 +38,19 @@ class Path:
 
     Attributes
     ----------
-    velocity : list of ndarray
-        Face arrays, ghosts valid.
+    velocity : Faces
+        Ghosts valid.
     span : float
         How long it carries, s.
     sweeps : int
+    crossed : int
+        Cells that no sweep goes beyond.
     """
 
     velocity: Faces
     span: float
     sweeps: int
+    crossed: int
 
 
 class Advection:
@@ -60,10 +63,16 @@ class Advection:
         Know what smoke comes in.
     interpolation : str
         ``cubic`` or ``linear``.
+
+    Attributes
+    ----------
+    sheets : Sheets or None
+        Carry what lies near sheets; None where nothing cuts cells.
     """
 
     def __init__(self, grid: MacGrid, surroundings: Surroundings, interpolation: str) -> None:
         self.grid, self.surroundings = grid, surroundings
+        self.sheets: Sheets | None = None
         self.cubic = interpolation == "cubic"
         self.reach = MAX_COURANT[interpolation]
         place = list(zip(grid.periodic, grid.ghost, grid.lo, grid.cells, grid.shape(None), strict=True))
@@ -81,47 +90,87 @@ class Advection:
         """
         grid = self.grid
         most = max(advect.largest(v) * span / h for v, h in zip(velocity, grid.dx, strict=True))
+        most = max(most, advect.largest(velocity.parts) * span / float(grid.dx.min()))
         courant = grid.comm.allreduce(most, op=MPI.MAX)
         if not courant <= MAX_CROSSINGS * max(grid.cells):
             raise SolveError(
                 f"the flow has blown up: it would cross {courant:.1e} cells, more than the whole grid "
                 f"{MAX_CROSSINGS} times, in one step of {span:g} s. Take a smaller dt, or look at what drives it."
             )
-        return Path(velocity, span, max(1, int(np.ceil(courant / self.reach))))
+        sweeps = max(1, int(np.ceil(courant / self.reach)))
+        return Path(velocity, span, sweeps, max(1, int(np.ceil(courant / sweeps))))
 
-    def carry(self, q: np.ndarray, path: Path, moved: np.ndarray, axis: int | None, out: np.ndarray) -> None:
-        """Carry q (faces of an axis; None: smoke in cells) into the owned part of ``out``. Collective.
+    def carry_faces(self, q: Faces, path: Path, moved: list[np.ndarray], out: Faces, keep: bool = False) -> None:
+        """Carry what is on faces into the owned part of ``out``. Collective.
 
         Parameters
         ----------
-        q : ndarray
+        q : Faces
             Ghosts valid.
         path : Path
-        moved : ndarray of bool
+        moved : list of ndarray of bool
             Where; elsewhere ``out`` is q.
-        axis : int or None
-        out : ndarray
+        out : Faces
+        keep : bool
+            Whether faces near sheets are to be told to ``keep_own``, too.
         """
-        grid = self.grid
-        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
-        courant = (*(path.span / path.sweeps / grid.dx), 0.0)[:3]
-        part = tuple((s.start, s.stop) for s in grid.owned(axis))
-        # smoke comes in from behind the sides, where the ghosts know what a jet carries
-        beyond = 0.5 if axis is None else 0.0
-        u, v, w = three(path.velocity)
-        for number in range(path.sweeps):
-            target = out if number == path.sweeps - 1 else np.empty_like(q)
-            low, high, bounded = self._low, self._high, axis is None
-            advect.sweep(
-                q, target, moved, u, v, w, offset, part, courant, low, high, beyond, self.cubic, bounded
-            )  # fmt: skip
-            if number < path.sweeps - 1:
-                grid.halo.exchange(target, axis)
-                if axis is None:
-                    self.surroundings.fill_smoke(target)
-                else:
-                    grid.fill_sides(target, axis)
+        keep = keep and path.sweeps == 1  # else it has all flowed on
+        for left in reversed(range(path.sweeps)):
+            target = Faces(np.empty_like(v) for v in q) if left else out
+            for axis, v in enumerate(q):
+                self._sweep(v, path, moved[axis], axis, 0.0, target[axis])
+            if self.sheets is not None:
+                self.sheets.carry_faces(q, path.velocity, moved, *self._limits(path), self.cubic, keep, target)
+            if left:
+                for axis, v in enumerate(target):
+                    self.grid.exchange_faces(axis, v)
+                    self.grid.fill_sides(v, axis)
                 q = target
+
+    def carry_smoke(
+        self, smoke: np.ndarray, extras: np.ndarray, path: Path, moved: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return smoke carried to the owned cells and to the further pieces of divided ones. Collective.
+
+        Parameters
+        ----------
+        smoke, extras : ndarray
+            Cell array, ghosts valid, and values of further pieces.
+        path : Path
+        moved : ndarray of bool
+            Where; elsewhere smoke stays.
+        """
+        # it comes in from behind the sides, where the ghosts know what a jet carries
+        beyond = 0.5
+        for left in reversed(range(path.sweeps)):
+            target = np.empty_like(smoke)
+            self._sweep(smoke, path, moved, None, beyond, target)
+            if self.sheets is not None:
+                extras = self.sheets.carry_smoke(
+                    smoke, extras, path.velocity, *self._limits(path), beyond, self.cubic, target
+                )
+            if left:
+                self.grid.exchange_cells(target)
+                self.surroundings.fill_smoke(target)
+            smoke = target
+        return smoke, extras
+
+    def _limits(self, path: Path) -> tuple[tuple, int, tuple, tuple]:
+        """Return how a sweep goes: dt / dx, how many cells away it may read, and the ends of the domain."""
+        courant = (*(path.span / path.sweeps / self.grid.dx), 0.0)[:3]
+        return courant, path.crossed + (2 if self.cubic else 1), self._low, self._high
+
+    def _sweep(
+        self, q: np.ndarray, path: Path, moved: np.ndarray, axis: int | None, beyond: float, out: np.ndarray
+    ) -> None:
+        """Carry the faces of an axis (cells: None) for one sweep as if nothing divided them."""
+        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
+        part = tuple((s.start, s.stop) for s in self.grid.owned(axis))
+        courant, _, low, high = self._limits(path)
+        bounded = axis is None
+        advect.sweep(
+            q, out, moved, *three(path.velocity), offset, part, courant, low, high, beyond, self.cubic, bounded
+        )  # fmt: skip
 
     def keep_own(self, own: np.ndarray, read: np.ndarray, path: Path, axis: int, out: np.ndarray) -> None:
         """Add to faces carried from ``read`` what they have beyond it, as far as it has not flowed on."""
@@ -150,11 +199,12 @@ class Transport:
         self.integrator: Newmark | Bdf2 | Midpoint = Newmark()
         self.advection = advection
         self.grid = advection.grid
-        self.carried: Faces = []
+        self.carried = Faces([])
         self.past: dict[str, Faces] = {
-            name: [self.grid.zeros_faces(axis) for axis in range(self.grid.dim)] for name in self.names
+            name: Faces(self.grid.zeros_faces(axis) for axis in range(self.grid.dim)) for name in self.names
         }
         self.past_dt = 0.0
+        self._before = self.carried, self.past
         self._whole: Path | None = None  # of the step being predicted, where it was needed
 
     def factor(self, dt: float) -> float:
@@ -180,15 +230,27 @@ class Transport:
     def predict(self, moved: list[np.ndarray], dt: float, star: Faces, extend: Extend) -> None:
         """Write what is carried to the owned faces into ``star``. Collective."""
         self._whole = self.advection.path(self.half_way(dt), dt)
-        for axis, v in enumerate(self.carried):
-            self.advection.carry(v, self._whole, moved[axis], axis, star[axis])
+        self.advection.carry_faces(self.carried, self._whole, moved, star)
 
-    def carry_smoke(self, smoke: np.ndarray, moved: np.ndarray, dt: float) -> np.ndarray:
-        """Return the smoke at the end of the step that was predicted, in the owned cells. Collective."""
-        out = np.empty_like(smoke)
+    def carry_smoke(
+        self, smoke: np.ndarray, extras: np.ndarray, moved: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smoke at the end of the step that was predicted, see ``Advection.carry_smoke``. Collective."""
         path = self._whole or self.advection.path(self.half_way(dt), dt)
-        self.advection.carry(smoke, path, moved, None, out)
-        return out
+        return self.advection.carry_smoke(smoke, extras, path, moved)
+
+    def remember(self) -> None:
+        """Keep what ``rewind`` puts back."""
+        self._before = self.carried, dict(self.past)
+
+    def rewind(self) -> None:
+        """Put all that this step has read back, as if it had not been tried."""
+        self.carried, self.past = self._before
+
+    def change(self, change: Callable[[Faces], Faces]) -> None:
+        """Replace all that the next step reads."""
+        self.carried = change(self.carried)
+        self.past = {name: change(faces) for name, faces in self.past.items()}
 
     def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
         """Return the velocity at the step's end, and remember what the next one reads. Collective.
@@ -234,7 +296,7 @@ class Bdf2Transport(Transport):
         if self.past_dt == 0.0 or later == 0.0:
             return self.carried
         s = later / self.past_dt
-        return [v + s * (v - before) for v, before in zip(self.carried, self.past["velocity_before"], strict=True)]
+        return each(lambda v, before: v + s * (v - before), self.carried, self.past["velocity_before"])
 
     def predict(self, moved: list[np.ndarray], dt: float, star: Faces, extend: Extend) -> None:
         """Write b v^n(x_d) - b' v^{n-1}(x_dd) into the owned part of ``star``. Collective."""
@@ -243,11 +305,12 @@ class Bdf2Transport(Transport):
             return
         b, b_past = self.scheme.weights(dt, self.past_dt)
         far = self.advection.path(self._at((dt - self.past_dt) / 2), dt + self.past_dt)
-        for axis, before in enumerate(self.past["velocity_before"]):
-            carried = np.empty_like(before)
-            self.advection.carry(before, far, moved[axis], axis, carried)
+        carried = Faces(np.empty_like(v) for v in star)
+        self.advection.carry_faces(self.past["velocity_before"], far, moved, carried)
+        for axis, v in enumerate(star):
             own = self.grid.owned(axis)
-            star[axis][own] = b * star[axis][own] - b_past * carried[own]
+            v[own] = b * v[own] - b_past * carried[axis][own]
+        star.parts = b * star.parts - b_past * carried.parts
 
     def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
         """Return v_w; the old velocity becomes the one before."""
@@ -277,7 +340,7 @@ class MidpointTransport(Transport):
     def __init__(self, advection: Advection) -> None:
         super().__init__(advection)
         self.scheme = self.integrator = Midpoint()
-        self._start: Faces = []
+        self._start = Faces([])
         self._read: Faces | None = None  # v'' as others read it
         self._last: tuple[Faces, Faces] | None = None
 
@@ -295,8 +358,9 @@ class MidpointTransport(Transport):
 
     def _at(self, later: float) -> Faces:
         """Return the velocity a time after t^n, on the line through that and the middle of the last step."""
-        pairs = zip(self.carried, self.past["velocity_middle"], strict=True)
-        return [self.scheme.later(v, w, later, self.past_dt) for v, w in pairs]
+        return each(
+            lambda v, w: self.scheme.later(v, w, later, self.past_dt), self.carried, self.past["velocity_middle"]
+        )
 
     def predict(self, moved: list[np.ndarray], dt: float, star: Faces, extend: Extend) -> None:
         """Write v' into the owned part of ``star``, and keep it for the kick. Collective."""
@@ -304,26 +368,30 @@ class MidpointTransport(Transport):
         path = self.advection.path(self._at((dt - self.past_dt) / 4), between)
         own = self.past["velocity_kicked"] if self.past_dt else self.carried
         if self._read is None:  # a run that is resumed
-            self._read = extend([v.copy() for v in own]) if self.past_dt else own
+            self._read = extend(each(np.copy, own)) if self.past_dt else own
+        self.advection.carry_faces(self._read, path, moved, star, keep=True)
         for axis, v in enumerate(self._read):
-            self.advection.carry(v, path, moved[axis], axis, star[axis])
             self.advection.keep_own(own[axis], v, path, axis, star[axis])
-        self._start = [v.copy() for v in star]
+        self._start = each(np.copy, star)
+
+    def change(self, change: Callable[[Faces], Faces]) -> None:
+        """Replace all that the next step reads, and what this one has begun with."""
+        super().change(change)
+        if self._start:
+            self._start = change(self._start)
 
     def accept(self, solved: Faces, kind: list[np.ndarray], dt: float, extend: Extend) -> Faces:
         """Return the velocity at the step's end. Collective."""
         before = self.past["velocity_middle"] if self.past_dt else self.carried
         middle = extend(solved)
-        ahead = [self.scheme.ahead(w, b, dt, self.past_dt) for w, b in zip(solved, before, strict=True)]
+        ahead = each(lambda w, b: self.scheme.ahead(w, b, dt, self.past_dt), solved, before)
         self.carried = extend(ahead)
-        given = [(k == kinds.WALL) | (k == kinds.SOLID_FACE) for k in kind]
-        kicked = [
-            np.where(where, end, 2 * w - start)
-            for where, end, w, start in zip(given, ahead, solved, self._start, strict=True)
-        ]
+        kicked = each(lambda w, start: 2 * w - start, solved, self._start)
+        for v, end, k in zip(kicked, ahead, kind, strict=True):
+            np.copyto(v, end, where=(k == kinds.WALL) | (k == kinds.SOLID_FACE))
         self._read = extend(kicked)
         self.past = {"velocity_middle": middle, "velocity_kicked": kicked}
-        self.past_dt, self._start, self._last = dt, [], (solved, kicked)
+        self.past_dt, self._start, self._last = dt, Faces([]), (solved, kicked)
         return ahead
 
 

@@ -1,0 +1,192 @@
+"""The grid around sheets that water has on both sides: which faces are divided, and what is seen from where."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.fields.mac import charts, kinds
+from petfsi.fields.mac.faces import Faces
+from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.parts import LocalParts, Parts, ranges
+
+#: Walls of so many cells or fewer are sheets, too: stencils of both sides would read the band in their middle.
+THICKEST = 2
+#: Cells that an extrapolation looks at on either side.
+AROUND = 3
+
+
+class Sheets:
+    """What carries water and smoke along sheets, each side by itself, for the grid as it is cut at the moment.
+
+    Parameters
+    ----------
+    grid : MacGrid
+    table : Parts
+    face_kind, narrow : list of ndarray
+        Face arrays, valid in all ghosts.
+    cell_kind : ndarray
+        Cell array, the same.
+
+    Attributes
+    ----------
+    table : Parts
+    local : LocalParts
+    """
+
+    def __init__(
+        self, grid: MacGrid, table: Parts, face_kind: list[np.ndarray], narrow: list[np.ndarray],
+        cell_kind: np.ndarray,
+    ) -> None:  # fmt: skip
+        self.grid, self.table = grid, table
+        self.local = LocalParts(grid, table)
+        inside = grid.inside(None)
+        self._low, self._high = (np.array([getattr(s, end) for s in inside]) for end in ("start", "stop"))
+        self._fluid, self._kind, self._narrow = cell_kind == kinds.FLUID, face_kind, narrow
+        thin = charts.thin_walls(three(face_kind), self._fluid, self._low, self._high, grid.dim, THICKEST)
+        self._near = thin | (self.local.extra >= 0) if len(table) else thin
+        #: Whether there is any sheet near this rank.
+        self.any = bool(self._near.any())
+        self.from_below = self._ends()
+        self._known = np.ones(len(table), dtype=bool)
+        self._targets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    @cached_property
+    def cut(self) -> charts.Cut:
+        """What kernels read."""
+        table, local = self.table, self.local
+        return charts.Cut(
+            three(self._kind), three(self._narrow), three(local.first), _flat(self._kind), _flat(local.first),
+            local.extra, self._fluid, table.first[1:][local.number], table.below, table.above, table.openness,
+            self._low, self._high, self.grid.dim,
+        )  # fmt: skip
+
+    def _ends(self) -> np.ndarray:
+        """Return whether each link sees what its piece below sees: where that above has several links, or is none."""
+        table, face = self.table, self.local.number
+        several = []
+        for piece in (table.below, table.above):
+            _, which, count = np.unique(np.column_stack((face, piece)), axis=0, return_inverse=True, return_counts=True)
+            several.append(count[which.ravel()] > 1)
+        return (table.above < 0) | (several[1] & ~several[0] & (table.below >= 0))
+
+    def _pieces(self, reach: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return this rank's pieces that lie so near a sheet: local cells (n, 3) and numbers."""
+        if reach not in self._targets:
+            near = self._near
+            for b in range(self.grid.dim):
+                near = _spread(near, b, reach)
+            part = self.grid.owned(None)
+            cells = np.argwhere(near[part] & self._fluid[part]) + [s.start for s in part]
+            local = self.local
+            others = np.column_stack(np.unravel_index(local.piece_cell, self.grid.shape(None))).reshape(-1, 3)
+            pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[local.pieces]))
+            self._targets[reach] = np.concatenate((cells, others)).astype(np.int64), pieces
+        return self._targets[reach]
+
+    # ---- transport --------------------------------------------------------------------------------------------
+
+    def carry_faces(
+        self, faces: Faces, path: Faces, moved: list[np.ndarray], courant: tuple, reach: int, low: tuple, high: tuple,
+        cubic: bool, keep: bool, out: Faces,
+    ) -> None:  # fmt: skip
+        """Carry what is on faces along a path, near sheets; see ``charts.carry_faces``. Collective."""
+        out.parts = faces.parts.copy()
+        done = np.zeros(len(self.table), dtype=bool)
+        if self.any:
+            cells, pieces = self._pieces(reach)
+            charts.carry_faces(
+                self.cut, cells, pieces, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
+                self._known, self.from_below, three(moved), courant, low, high, cubic, keep, three(out), out.parts,
+                done,
+            )  # fmt: skip
+        out.parts = self.local.gathered(out.parts, np.flatnonzero(done))
+        self.local.mean_into(out, out.parts)
+
+    def carry_smoke(
+        self, smoke: np.ndarray, extras: np.ndarray, path: Faces, courant: tuple, reach: int, low: tuple, high: tuple,
+        beyond: float, cubic: bool, out: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
+        """Carry smoke along a path, near sheets; return that of the further pieces. Collective."""
+        further = extras.copy()
+        done = np.zeros(len(extras), dtype=bool)
+        if self.any:
+            cells, pieces = self._pieces(reach)
+            charts.carry_cells(
+                self.cut, cells, pieces, reach, three(path), path.parts, self._known, smoke, extras, courant, low,
+                high, beyond, cubic, out, further, done,
+            )  # fmt: skip
+        return self.local.gathered(further, np.flatnonzero(done))
+
+    # ---- new parts --------------------------------------------------------------------------------------------
+
+    def guess_faces(self, faces: Faces, known: np.ndarray) -> None:
+        """Extrapolate the links that are not ``known`` from their own sides; all ghosts are valid. Collective."""
+        if known.all():
+            return
+        grid, table = self.grid, self.table
+        out, mine = faces.parts.copy(), []
+        for a in range(grid.dim):
+            flat, which = self.local.faces[a]
+            count = np.diff(table.first)[which]
+            rows = ranges(table.first[which], count)
+            cell = np.column_stack(np.unravel_index(np.repeat(flat, count), grid.shape(a))).reshape(-1, 3)
+            up = self.from_below[rows]
+            cell[:, a] -= up
+            part = grid.owned(None)
+            use = ~known[rows]
+            for b, s in enumerate(part):
+                use &= (cell[:, b] >= s.start) & (cell[:, b] < s.stop)
+            rows, cell, up = rows[use], cell[use].astype(np.int64), up[use].astype(np.int64)
+            pieces = np.where(up == 1, table.below[rows], table.above[rows])
+            axis = np.full(len(rows), a)
+            charts.guess_links(
+                self.cut, rows, axis, cell, pieces, up, AROUND, three(faces), faces.parts, known, out
+            )  # fmt: skip
+            mine.append(rows)
+        faces.parts = self.local.gathered(out, np.concatenate(mine))
+
+    def guess_smoke(self, smoke: np.ndarray, extras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return smoke with what is not a number replaced by what is known around on its own side. Collective.
+
+        Parameters
+        ----------
+        smoke : ndarray
+            Cell array, ghosts valid.
+        extras : ndarray
+            Of further pieces.
+        """
+        grid, local = self.grid, self.local
+        unknown = np.isnan(smoke) & (local.extra >= 0)
+        if not grid.comm.allreduce(bool(unknown.any() or np.isnan(extras).any()), op=MPI.LOR):
+            return smoke, extras
+        part = grid.owned(None)
+        cells = np.argwhere(unknown[part]) + [s.start for s in part]
+        use = np.isnan(extras[local.pieces])
+        rows = local.pieces[use]
+        others = np.column_stack(np.unravel_index(local.piece_cell[use], grid.shape(None))).reshape(-1, 3)
+        pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[rows]))
+        where = np.concatenate((cells, others)).astype(np.int64)
+        guess = np.nan_to_num(charts.guess_cells(self.cut, where, pieces, AROUND, smoke, extras))
+        smoke, extras = smoke.copy(), extras.copy()
+        smoke[tuple(cells.T)] = guess[: len(cells)]
+        grid.exchange_cells(smoke)
+        extras[rows] = guess[len(cells) :]
+        return smoke, local.gathered(extras, rows)
+
+
+def _spread(marked: np.ndarray, axis: int, reach: int) -> np.ndarray:
+    """Return which entries have a marked one within so many along an axis."""
+    view = np.moveaxis(marked, axis, 0)
+    out = view.copy()
+    for shift in range(1, reach + 1):
+        out[shift:] |= view[:-shift]
+        out[:-shift] |= view[shift:]
+    return np.moveaxis(out, 0, axis)
+
+
+def _flat(arrays: list[np.ndarray]) -> np.ndarray:
+    """Return the entries of arrays one after the other."""
+    return np.concatenate([array.reshape(-1) for array in arrays])

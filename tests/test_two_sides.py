@@ -1,0 +1,246 @@
+"""Both sides of sheets thinner than a cell: water of its own on each, at rest or moving, on any number of ranks."""
+
+import numpy as np
+import pytest
+from mac_cases import reader, whole_state
+from mpi4py import MPI
+from test_cutcell import DIRECT, PERIODIC, RHO
+
+from petfsi.bench import theory
+from petfsi.bench.case import simulation
+from petfsi.scene.schema import Scene
+
+N = 18
+
+
+def own_part(fluid, array, axis):
+    """Return the values and the coordinates of this rank's own faces of an axis (cells: None)."""
+    part = fluid.grid.owned(axis)
+    x = np.broadcast_arrays(*fluid.grid.coordinates(axis), array)[: fluid.dim]
+    return array[part], [line[part] for line in x]
+
+
+def sheared(dim, height, thickness, cells=N, **more):
+    """Return a vortex above a sheet at rest across a closed box, over water at rest; smoke above."""
+    low = height + thickness / 2
+    depth = 1 - low
+    u = f"pi/{depth}*sin(pi*x)*cos(pi*(y-{low})/{depth})/3"
+    v = f"-pi*cos(pi*x)*sin(pi*(y-{low})/{depth})/3"
+    velocity = [f"where(y>{height},{u},0)", f"where(y>{height},{v},0)", "0"][:dim]
+    fluid = {"density": 1.0, "origin": [0.0] * dim, "size": [1.0] * dim, "cells": [cells] * dim}
+    fluid |= {"initial": {"velocity": velocity}, "smoke": {"initial": f"where(y>{height},1,0)"}}
+    shape = {"box": {"origin": [-1.0, height - thickness / 2, -1.0][:dim], "size": [3.0, thickness, 3.0][:dim]}}
+    time = {"end": 10.0, "dt": 0.5 / cells, "integrator": more.pop("integrator", "bdf2")}
+    return Scene.model_validate(
+        {"dim": dim, "time": time, "fluid": fluid, "obstacles": {"sheet": {"shape": shape}}, **more}
+    )
+
+
+#: Where sheets lie: in a cell's middle, off it, in a plane of the grid, and walls of one cell and of two.
+SHEETS = {
+    "middle": (8.5 / N, 0.002),
+    "off": (8.8 / N, 0.002),
+    "plane": (8 / N, 0.002),
+    "one cell": (8.5 / N, 1 / N),
+    "two cells": (8 / N, 2 / N),
+}
+
+
+def see_rest_below(comm, name, integrator):
+    height, thickness = SHEETS[name]
+    with simulation(comm, sheared(2, height, thickness, integrator=integrator), DIRECT) as sim:
+        for _ in range(12):
+            sim.advance()
+        for axis in range(2):
+            v, x = own_part(sim.fluid, sim.fluid.velocity[axis], axis)
+            assert np.abs(v[x[1] < height - 0.5 / N]).max(initial=0.0) < 1e-12
+        smoke, x = own_part(sim.fluid, sim.fluid.smoke, None)
+        assert np.abs(smoke[x[1] < height - thickness / 2 - 0.5 / N]).max(initial=0.0) == 0.0
+        above = smoke[x[1] > height + thickness / 2 + 0.5 / N]
+        assert np.abs(above - 1.0).max(initial=0.0) < 1e-14
+        assert np.all(np.isin(np.round(sim.fluid.smoke_parts, 13), (0.0, 1.0)))
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+@pytest.mark.parametrize("name", SHEETS)
+def test_water_below_a_sheet_stays_at_rest_and_clear(name, integrator):
+    see_rest_below(MPI.COMM_SELF, name, integrator)
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("name", ["middle", "off"])
+def test_ranks_keep_the_sides_of_a_sheet_apart(name):
+    see_rest_below(MPI.COMM_WORLD, name, "bdf2")
+
+
+def test_a_sheet_in_space_keeps_its_sides_apart():
+    height, thickness = 6.4 / 12, 0.002
+    with simulation(MPI.COMM_SELF, sheared(3, height, thickness, 12), "monolithic.opts") as sim:
+        for _ in range(3):
+            sim.advance()
+        for axis in range(3):
+            v, x = own_part(sim.fluid, sim.fluid.velocity[axis], axis)
+            assert np.abs(v[x[1] < height - 0.5 / 12]).max() < 1e-12
+        smoke, x = own_part(sim.fluid, sim.fluid.smoke, None)
+        assert np.abs(smoke[x[1] < height - 0.5 / 12]).max() == 0.0
+        assert np.abs(smoke[x[1] > height + 0.5 / 12] - 1.0).max() < 1e-14
+
+
+# ---- sheets that move -------------------------------------------------------------------------------------------
+
+
+def piston(speed, start, end, integrator="bdf2", sides=None, **more):
+    """Return a strip that is moved through water that moves alike, smoke to the right of where it begins."""
+    held = [{"where": "all", "fix": ["x", "y", "angle"], "velocity": {"x": speed[0], "y": speed[1]}}]
+    shape = {"beam": {"start": start, "end": end, "thickness": 0.004, "elements": 10}}
+    fluid = {"density": RHO, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [N, N], "sides": sides or {}}
+    slope = (end[0] - start[0]) / (end[1] - start[1])
+    right = f"where(x>{start[0]}+{slope}*(y-{start[1]}),1,0)"
+    fluid |= {"initial": {"velocity": [str(s) for s in speed]}, "smoke": {"initial": right}}
+    solid = {"shape": shape, "supports": held, "young": 1e6, "poisson": 0.3, "density": RHO}
+    time = {"end": 10.0, "dt": 0.02, "integrator": integrator}
+    return Scene.model_validate({"dim": 2, "time": time, "fluid": fluid, "solids": {"body": solid}, **more})
+
+
+@pytest.mark.parallel([1, 3])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+def test_a_piston_carries_the_water_on_both_sides_and_mixes_none(integrator):
+    """Across seven cells."""
+    scene = piston([0.9, 0.0], [0.31, 0.0], [0.31, 1.0], integrator, {"left": "open", "right": "open"})
+    with simulation(MPI.COMM_WORLD, scene, DIRECT) as sim:
+        for _ in range(25):
+            sim.advance()
+        place = 0.31 + 0.9 * sim.time
+        for axis, speed in enumerate((0.9, 0.0)):
+            v, _ = own_part(sim.fluid, sim.fluid.velocity[axis], axis)
+            assert np.abs(v - speed).max() < 1e-10
+        smoke, x = own_part(sim.fluid, sim.fluid.smoke, None)
+        assert np.abs(smoke[x[0] < place - 0.51 / N]).max(initial=0.0) == 0.0
+        assert np.abs(smoke[x[0] > place + 0.51 / N] - 1.0).max(initial=0.0) < 1e-14
+        assert np.all(np.isin(np.round(sim.fluid.smoke_parts, 13), (0.0, 1.0)))
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_slanting_sheet_mixes_no_smoke_as_it_crosses_cells():
+    scene = piston([0.5, 0.2], [0.2, -0.3], [0.45, 1.1], sides=dict.fromkeys(PERIODIC, "open"))
+    with simulation(MPI.COMM_WORLD, scene, "monolithic.opts") as sim:
+        for _ in range(25):
+            sim.advance()
+        for axis, speed in enumerate((0.5, 0.2)):
+            v, _ = own_part(sim.fluid, sim.fluid.velocity[axis], axis)
+            assert np.abs(v - speed).max() < 1e-8
+        smoke, x = own_part(sim.fluid, sim.fluid.smoke, None)
+        side = x[0] - 0.5 * sim.time - 0.2 - 0.25 / 1.4 * (x[1] - 0.2 * sim.time + 0.3)
+        assert np.abs(smoke[side < -0.6 / N]).max(initial=0.0) < 1e-12
+        assert np.abs(smoke[side > 0.6 / N] - 1.0).max(initial=0.0) < 1e-12
+
+
+def stepped(comm, scene, steps, state=None):
+    """Return the fluid's whole state after steps, from another state if there is one."""
+    with simulation(comm, scene, "monolithic.opts") as sim:
+        if state is not None:
+            sim.restore(*state[0], lambda name: reader(state[1][name]))
+        for _ in range(steps):
+            sim.advance()
+        groups = {field.name: whole_state(field) for field in sim.fields}
+        groups["accounts"] = whole_state(AsField(sim.comm, sim.accounts.state()))
+        return (sim.step, sim.time, sim.dt), groups
+
+
+class AsField:
+    """What ``whole_state`` asks of a field."""
+
+    def __init__(self, comm, slabs):
+        self.comm, self.slabs = comm, slabs
+
+    def state(self):
+        return self.slabs
+
+
+def bent(integrator="bdf2"):
+    """Return a free slanting strip in a vortex that bends and turns it, smoke above it."""
+    shape = {"beam": {"start": [0.22, 0.35], "end": [0.79, 0.57], "thickness": 0.004, "elements": 12}}
+    solid = {"shape": shape, "young": 1e9, "poisson": 0.3, "density": RHO, "initial": {"velocity": ["0.3", "0.2"]}}
+    fluid = {"density": RHO, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [24, 24]}
+    fluid |= {"initial": {"velocity": ["sin(pi*x)*cos(pi*y)", "-cos(pi*x)*sin(pi*y)"]}}
+    fluid |= {"smoke": {"initial": "where(y>0.47+0.386*(x-0.5),1,0)"}}
+    time = {"end": 1.0, "dt": 0.01, "integrator": integrator}
+    return Scene.model_validate({"dim": 2, "time": time, "fluid": fluid, "solids": {"body": solid}})
+
+
+@pytest.mark.parallel([2, 3, 4])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2"])
+def test_a_strip_bends_alike_on_any_number_of_ranks(integrator):
+    states = [stepped(comm, bent(integrator), 10)[1]["pressure"] for comm in (MPI.COMM_SELF, MPI.COMM_WORLD)]
+    assert len(states[0]["parts_axis"]) > 40
+    for name in states[0]:
+        scale = np.abs(states[0][name]).max(initial=0.0)
+        np.testing.assert_allclose(states[1][name], states[0][name], rtol=0, atol=1e-7 * scale, err_msg=name)
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2"])
+def test_both_sides_of_a_strip_come_back_from_a_checkpoint(integrator):
+    """Bit for bit on as many ranks."""
+    comm = MPI.COMM_WORLD
+    _, whole = stepped(comm, bent(integrator), 8)
+    _, parts = stepped(comm, bent(integrator), 3, stepped(comm, bent(integrator), 5))
+    assert not [
+        (group, name)
+        for group, arrays in whole.items()
+        for name, array in arrays.items()
+        if not np.array_equal(array, parts[group][name])
+    ]
+
+
+@pytest.mark.parallel([2])
+def test_a_strip_goes_on_alike_on_other_ranks():
+    _, whole = stepped(MPI.COMM_SELF, bent(), 6)
+    _, parts = stepped(MPI.COMM_WORLD, bent(), 2, stepped(MPI.COMM_SELF, bent(), 4))
+    for name, array in whole["pressure"].items():
+        scale = np.abs(array).max(initial=0.0)
+        np.testing.assert_allclose(parts["pressure"][name], array, rtol=0, atol=1e-7 * scale, err_msg=name)
+
+
+# ---- the plate between two layers -------------------------------------------------------------------------------
+
+THICKNESS, STIFFNESS = 0.002, 1000.0
+
+
+def plate(cells, place):
+    """Return a plate across a closed box that swings as cos(pi x), its water with it, and its angular frequency."""
+    height, k = 0.5 + place / cells, np.pi
+    above, below = 1 - height, height
+    water = RHO / k * (1 / np.tanh(k * above) + 1 / np.tanh(k * below))
+    omega = np.sqrt(STIFFNESS * k**4 / (RHO * THICKNESS + water))
+    up, down = f"1e-7/sinh(pi*{above})", f"1e-7/sinh(pi*{below})"
+    u = f"where(y>{height},{up}*sin(pi*x)*cosh(pi*(1-y)),-{down}*sin(pi*x)*cosh(pi*y))"
+    v = f"where(y>{height},{up}*cos(pi*x)*sinh(pi*(1-y)),{down}*cos(pi*x)*sinh(pi*y))"
+    shape = {"start": [0.0, height], "end": [1.0, height], "thickness": THICKNESS, "elements": 32}
+    solid = {"shape": {"beam": shape | {"theory": "euler-bernoulli"}}, "density": RHO, "poisson": 0.0}
+    solid |= {"young": 12 * STIFFNESS / THICKNESS**3, "initial": {"velocity": ["0", "1e-7*cos(pi*x)"]}}
+    solid |= {"supports": [{"where": end, "fix": ["x", "angle"]} for end in ("start", "end")]}
+    fluid = {"density": RHO, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [cells, cells]}
+    scene = {"dim": 2, "fluid": fluid | {"initial": {"velocity": [u, v]}}, "solids": {"plate": solid}}
+    scene["time"] = {"end": 100.0, "dt": 2 * np.pi / omega / 50, "integrator": "bdf2"}
+    scene["probes"] = {"middle": {"of": "plate", "at": [0.0, height], "quantity": "displacement"}}
+    return Scene.model_validate(scene), omega
+
+
+def test_a_plate_inside_a_cell_swings_with_second_order():
+    modes, damping = [], []
+    for cells in (8, 16, 32):
+        scene, omega = plate(cells, 0.4)
+        with simulation(MPI.COMM_SELF, scene, DIRECT) as sim:
+            swing = []
+            for _ in range(75):
+                sim.advance()
+                swing.append(sim.probe()[1])
+        t = sim.dt * np.arange(1, 76)
+        seen, lost = theory.fit_damped_sinusoid(t[6:], np.array(swing[6:]), omega, 0.0)
+        modes.append(theory.undo("bdf2", seen, sim.dt) / omega - 1)
+        damping.append(lost / omega - theory.observed("bdf2", omega, sim.dt)[1] / omega)
+    steps = np.diff(modes)
+    assert np.log2(steps[0] / steps[1]) == pytest.approx(2.0, abs=0.25), modes
+    assert abs(modes[-1]) < 2e-3, modes
+    assert np.abs(damping[1:]).max() < 2e-5, damping
