@@ -100,6 +100,8 @@ class CutGrid:
         own = np.zeros(grid.shape(None), dtype=bool)
         own[grid.owned(None)] = True
         self._own = own.reshape(-1)[self._flat]  # a ghost may stand for a cell of this rank: only that one counts
+        #: Whether any cell was divided when the grid was last cut: then walls say what became of its pieces.
+        self.had_parts = False
         self._covered = np.zeros(grid.shape(None), dtype=bool)
         static = self.cut(np.zeros((0, dim)), np.zeros((0, dim), dtype=np.int64))
         self._covered = static.cell_kind == kinds.SOLID
@@ -238,8 +240,13 @@ class CutGrid:
     def _number(self, found: CutCells, links: Links) -> tuple[Layout, np.ndarray, Extras | None, Parts, np.ndarray]:
         """Return layout, cell numbers, extras, parts, and the global number of each slot. Collective."""
         grid = self.grid
+        had_parts, self.had_parts = self.had_parts, True
         if not grid.comm.allreduce(bool(len(found.extra_cell) or links.split.any()), op=MPI.LOR):
-            return grid.layout, grid.index, None, Parts.none(), grid.index.reshape(-1)[self._flat]
+            self.had_parts = False
+            parts = Parts.none()
+            if had_parts:
+                parts = Parts.gathered(grid, np.zeros((0, 3)), np.zeros((0, 5)), self._wall_areas(found))
+            return grid.layout, grid.index, None, parts, grid.index.reshape(-1)[self._flat]
         local = self._flat[found.extra_cell]
         mine = np.flatnonzero(self._own[found.extra_cell])
         layout = Layout.of(grid.comm, grid.layout.n_local + len(mine))
@@ -277,7 +284,7 @@ class CutGrid:
             here = np.flatnonzero((axis == a) & use)
             natural[here], is_owned[here] = global_index(grid, a, face[here]), owned(grid, a, face[here])
         table = np.column_stack((axis, natural, *names, opening))[use & is_owned]
-        parts = Parts.gathered(grid, self._split_pieces(found), table, self._split_walls(found))
+        parts = Parts.gathered(grid, self._split_pieces(found), table, self._wall_areas(found))
         use = np.flatnonzero(use)
         row = parts.rows(axis[use], natural[use], names[0][use], names[1][use])
         order = use[np.argsort(row, kind="stable")]
@@ -290,11 +297,9 @@ class CutGrid:
         cell = global_index(self.grid, None, self._flat[found.extra_cell[mine]])
         return np.column_stack((cell, found.extra_piece[mine], found.extra_volume[mine]))
 
-    def _split_walls(self, found: CutCells) -> np.ndarray:
-        """Return cell, piece, facet and area of the walls of this rank's split cells, shape (n, 4)."""
-        split = np.zeros(len(self._own), dtype=bool)
-        split[found.extra_cell] = True
-        mine = np.flatnonzero((split & self._own)[found.cell])
+    def _wall_areas(self, found: CutCells) -> np.ndarray:
+        """Return cell, piece, facet and area of the walls of this rank's cells, shape (n, 4)."""
+        mine = np.flatnonzero(self._own[found.cell])
         cell = global_index(self.grid, None, self._flat[found.cell[mine]])
         return np.column_stack((cell, found.piece[mine], found.facet[mine], found.integrals[mine].sum(axis=1)))
 

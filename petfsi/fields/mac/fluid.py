@@ -449,6 +449,8 @@ class MacFluid(CoveredGrid):
         assert self.narrow is not None
         self.sheets = Sheets(self.grid, Parts.restored(read), self.face_kind, self.narrow, self.cell_kind)
         self._transport.advection.sheets = self.sheets
+        assert self._cutter is not None
+        self._cutter.had_parts = len(self.sheets.table) > 0
         stored = {name: read_whole(read, f"parts_{name}") for name in self._on_parts()}
         self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
         self._transport.carried.parts = self.velocity.parts

@@ -2,9 +2,9 @@
 
 Numbers of pieces say nothing over time: piece 0 is the largest, and a sheet that crosses the middle of a cell swaps
 the two. A piece goes on as that old one of its cell which shares most of its walls, by facets; if there is none, as
-that whose openings overlap most with its own. A cell that was whole goes on as its largest piece. A link goes on as
-that between the pieces that its own go on as, or of one of them, on the same face. What goes on as nothing begins
-with what its own side's surroundings say.
+that whose openings overlap most with its own or, in a cell that was whole or has become so, as the largest. A link
+goes on as that between the pieces that its own go on as, or of one of them, on the same face. What goes on as nothing
+begins with what its own side's surroundings say. So a sheet may go half a cell a step.
 """
 
 from __future__ import annotations
@@ -38,15 +38,17 @@ class Lineage:
     def __init__(self, grid: MacGrid, old: Sheets, new: Sheets, old_kind: list[np.ndarray]) -> None:
         self.grid, self.old, self.new = grid, old, new
         before, after = old.table, new.table
-        cells, first, piece = _matched(grid, before, after)
+        cells, first, piece, guessed = _matched(grid, before, after)
         self._source = _links(grid, before, after, cells, first, piece)
         self._known = self._with_kinds(old_kind)
-        self._plain = self._healed()
+        self._plain = self._healed(cells, first, piece)
         row = before.first_piece(after.cell)
         self._pieces = _of_pieces(after, cells, first, piece, row)
         zero = piece[first[:-1]] if len(cells) else np.zeros(0, np.int64)
         swapped = zero > 0
         self._swapped = cells[swapped], before.first_piece(cells[swapped]) + zero[swapped] - 1
+        self._lost = cells[zero == LOST]
+        self._guessed = cells[guessed & (np.diff(first) > 1)]
 
     def _with_kinds(self, old_kind: list[np.ndarray]) -> np.ndarray:
         """Return which links go on as something, of whole faces those alone that had a velocity. Collective."""
@@ -55,11 +57,15 @@ class Lineage:
         known = np.where(self._source == WHOLE, 1.0 - dead, self._source >= 0)
         return local.gathered(known, local.link) > 0.0
 
-    def _healed(self) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _healed(self, cells: np.ndarray, first: np.ndarray, piece: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return by axis the local faces that are no longer divided, and the old links whose values they take."""
         before, found = self.old.table, []
         begin = before.first[:-1]
-        best = _widest_of_whole(before.first, before.below, before.above, before.openness)
+        below, above = (
+            _went_on(np.where(beside >= 0, 0, -1), beside, cells, first, piece)
+            for beside in (cells_beside(self.grid, before, side)[begin] for side in (True, False))
+        )
+        best = _widest(before.first, before.below, before.above, before.openness, below, above)
         gone = self.new.table.rows_of_faces(before.axis[begin], before.face[begin]) < 0
         for flat, which in self.old.local.faces:
             use = gone[which]
@@ -98,10 +104,11 @@ class Lineage:
         cells, rows = self._swapped
         flat, which = local_images(self.grid, None, cells)
         whole.reshape(-1)[flat] = extras[rows[which]]
+        flat, _ = local_images(self.grid, None, self._lost)
+        whole.reshape(-1)[flat] = np.nan
         # of a cell that was whole, the piece in its middle takes the value, if there is one
-        new = np.unique(table.cell[self.old.table.first_piece(table.cell) < 0])
-        flat, which = local_images(self.grid, None, new)
-        others = np.array([np.searchsorted(table.cell, new, side) for side in ("left", "right")])
+        flat, which = local_images(self.grid, None, self._guessed)
+        others = np.array([np.searchsorted(table.cell, self._guessed, side) for side in ("left", "right")])
         total = np.concatenate(([0.0], np.cumsum(table.volume)))
         aside = volume.reshape(-1)[flat] - (total[others[1]] - total[others[0]])[which] <= CENTRE
         whole.reshape(-1)[flat[aside]] = np.nan
@@ -114,8 +121,8 @@ class Lineage:
         return self.new.guess_smoke(whole, local.gathered(further, local.pieces))
 
 
-def _matched(grid: MacGrid, before: Parts, after: Parts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the cells divided before and after, and the old piece that each new one goes on as.
+def _matched(grid: MacGrid, before: Parts, after: Parts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cells divided before or after, and the old piece that each new one goes on as.
 
     Returns
     -------
@@ -124,16 +131,19 @@ def _matched(grid: MacGrid, before: Parts, after: Parts) -> tuple[np.ndarray, np
         Where their pieces begin.
     piece : ndarray of int64
         Piece 0, 1, ... of each cell: an old piece or LOST.
+    guessed : ndarray of bool, shape (n,)
+        Whether nothing but its size speaks for the largest piece of a cell that was whole or is so now.
     """
-    cells = np.intersect1d(before.cell, after.cell)
+    cells = np.union1d(before.cell, after.cell)
     counts = [1 + np.searchsorted(t.cell, cells, "right") - np.searchsorted(t.cell, cells) for t in (before, after)]
     walls = [np.stack([np.searchsorted(t.wall_cell, cells, end) for end in ("left", "right")]) for t in (before, after)]
     openings = [_openings(grid, t, cells, n) for t, n in zip((before, after), counts, strict=True)]
     first = np.concatenate(([0], np.cumsum(counts[1])))
     piece = np.full(first[-1], LOST)
     old, new = ((t.wall_piece, t.wall_facet, t.wall_area) for t in (before, after))
-    _match_pieces(counts[0], counts[1], walls[0], walls[1], old, new, openings[0], openings[1], first, piece)
-    return cells, first, piece
+    guessed = np.zeros(len(cells), dtype=bool)
+    _match_pieces(counts[0], counts[1], walls[0], walls[1], old, new, openings[0], openings[1], first, piece, guessed)
+    return cells, first, piece, guessed
 
 
 def _openings(grid: MacGrid, table: Parts, cells: np.ndarray, count: np.ndarray) -> np.ndarray:
@@ -165,7 +175,7 @@ def cells_beside(grid: MacGrid, table: Parts, below: bool) -> np.ndarray:
 
 
 @njit(cache=True)
-def _match_pieces(n_old, n_new, old_range, new_range, old, new, old_open, new_open, first, out):
+def _match_pieces(n_old, n_new, old_range, new_range, old, new, old_open, new_open, first, out, guessed):
     """Fill the old piece that each new one of some cells goes on as, see ``_matched``."""
     (old_piece, old_facet, old_area), (new_piece, new_facet, new_area) = old, new
     begin = 0
@@ -177,10 +187,14 @@ def _match_pieces(n_old, n_new, old_range, new_range, old, new, old_open, new_op
                     shared[new_piece[p], old_piece[q]] += min(new_area[p], old_area[q])
         used = np.zeros(n_old[c], np.bool_)
         _pair(shared, out[first[c] : first[c + 1]], used)
-        for i in range(n_new[c]):
-            for j in range(n_old[c]):
-                shared[i, j] = np.minimum(new_open[first[c] + i], old_open[begin + j]).sum()
-        _pair(shared, out[first[c] : first[c + 1]], used)
+        if n_old[c] == 1 or n_new[c] == 1:
+            if out[first[c]] < 0 and not used[0]:
+                out[first[c]], guessed[c] = 0, True
+        else:
+            for i in range(n_new[c]):
+                for j in range(n_old[c]):
+                    shared[i, j] = np.minimum(new_open[first[c] + i], old_open[begin + j]).sum()
+            _pair(shared, out[first[c] : first[c + 1]], used)
         begin += n_old[c]
 
 
@@ -199,7 +213,7 @@ def _pair(score, match, used):
 
 
 def _went_on(
-    table: Parts, cell: np.ndarray, piece: np.ndarray, cells: np.ndarray, first: np.ndarray, match: np.ndarray
+    piece: np.ndarray, cell: np.ndarray, cells: np.ndarray, first: np.ndarray, match: np.ndarray
 ) -> np.ndarray:
     """Return the old pieces that new ones of any cells go on as; LOST, or -1 for -1."""
     old = np.where(piece > 0, LOST, piece)
@@ -215,7 +229,7 @@ def _links(
 ) -> np.ndarray:
     """Return the old link that each new one goes on as, WHOLE or LOST."""
     below, above = (
-        _went_on(after, cells_beside(grid, after, side), piece, cells, first, match)
+        _went_on(piece, cells_beside(grid, after, side), cells, first, match)
         for side, piece in ((True, after.below), (False, after.above))
     )
     row = before.rows_of_faces(after.axis, after.face)
@@ -251,11 +265,11 @@ def _closest(begin, end, old_below, old_above, openness, below, above):
 
 
 @njit(cache=True)
-def _widest_of_whole(first, below, above, openness):
-    """Return for each divided face the link that it takes after if it is divided no more."""
+def _widest(first, below, above, openness, want_below, want_above):
+    """Return for each divided face the link that it takes after, given old pieces of its cells, if it is no more."""
     best = np.empty(len(first) - 1, np.int64)
     for face in range(len(best)):
-        best[face] = _closest(first[face], first[face + 1], below, above, openness, 0, 0)
+        best[face] = _closest(first[face], first[face + 1], below, above, openness, want_below[face], want_above[face])
         if best[face] < 0:
             best[face] = first[face]
     return best
@@ -263,5 +277,5 @@ def _widest_of_whole(first, below, above, openness):
 
 def _of_pieces(after: Parts, cells: np.ndarray, first: np.ndarray, match: np.ndarray, row: np.ndarray) -> np.ndarray:
     """Return the row of the old further piece that each new one goes on as, WHOLE or LOST."""
-    old = _went_on(after, after.cell, after.piece, cells, first, match)
+    old = _went_on(after.piece, after.cell, cells, first, match)
     return np.where(old > 0, row + old - 1, np.where(old == 0, WHOLE, LOST))
