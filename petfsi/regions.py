@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.couplings.enclosure import Enclosure
 from petfsi.fields.base import FluidField, Reader, Slab, SolidField
-from petfsi.fields.solid.partition import slab
 from petfsi.lasting import TABLES, Tracked, bounded_most, looked_up, meeting, pairs
 from petfsi.system import System
+
+if TYPE_CHECKING:
+    from petfsi.couplings.enclosure import Enclosure
 
 #: A region keeps its volume to this part of it, and to this part of a cell.
 CLOSE = 1e-11
@@ -342,7 +344,7 @@ class ClosedRegions:
         assert self._tracked is not None
         known, comm = self._tracked, self.system.comm
         facets = known.facets
-        n, mine = len(facets), slice(*slab(len(facets), comm.rank, comm.size))
+        n, mine = len(facets), slice(*_share(len(facets), comm))
         arrays = {}
         for name in ("region", *TABLES):
             of = None if name == "region" else getattr(known, name)
@@ -356,7 +358,7 @@ class ClosedRegions:
         """Take up a state. Collective."""
         assert self._tracked is not None
         comm, n = self.system.comm, len(self._tracked.facets)
-        begin, end = slab(n, comm.rank, comm.size)
+        begin, end = _share(n, comm)
         number, *by_cell = (self.fluid.read_cells(read, name) for name in ("region", *TABLES))
         facets, *by_facet = (
             np.concatenate(comm.allgather(np.asarray(read(f"facet_{name}", (begin,), (end - begin,)), dtype=float)))
@@ -383,6 +385,11 @@ class ClosedRegions:
         outflow = self.system.residual.array[self.system.piece(self.fluid.name)] / self.fluid.row_scale
         sums = self.system.comm.allreduce(np.array([outflow @ member for member in self._members]))
         return float(np.max(np.abs(sums) * dt / self._cut_sizes))
+
+
+def _share(n: int, comm: MPI.Comm) -> tuple[int, int]:
+    """Return begin and end of this rank's share of ``n`` things."""
+    return n * comm.rank // comm.size, n * (comm.rank + 1) // comm.size
 
 
 def _attach(mat: PETSc.Mat, members: list[np.ndarray]) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
 
-from petfsi.couplings.enclosure import Enclosure
 from petfsi.fields.base import Work
+
+if TYPE_CHECKING:
+    from petfsi.couplings.enclosure import Enclosure
 
 
 class Coupling(ABC):
