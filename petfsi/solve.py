@@ -375,8 +375,6 @@ class Solver:
             good = finite and not failed
         else:
             good = finite and ksp.getConvergedReason() >= 0 and norms[""] <= wanted
-            if finite and not good and not failed and norms[""] <= SLACK * self.system.round_off():
-                good = True  # nothing is left but round-off
         if good:
             return
         by_field = ", ".join(f"{field.name} {norms[field.name]:.1e}" for field in self.system.fields)

@@ -232,7 +232,8 @@ def test_a_plate_inside_a_cell_swings_with_second_order():
     modes, damping = [], []
     for cells in (8, 16, 32):
         scene, omega = plate(cells, 0.4)
-        with simulation(MPI.COMM_SELF, scene, DIRECT) as sim:
+        # not by LU: the beam does not give way to a pressure that both rooms have in common
+        with simulation(MPI.COMM_SELF, scene, "monolithic.opts") as sim:
             swing = []
             for _ in range(75):
                 sim.advance()

@@ -139,7 +139,7 @@ def run(data, steps):
 
 def sheet_on_corner(dim, foot):
     """A sheet that hangs from the top and stands on, or in, an obstacle."""
-    cells = [16, 16] if dim == 2 else [12, 12, 6]
+    cells = [24, 16] if dim == 2 else [12, 12, 6]
     fluid = {"density": 1000.0, "origin": [0.0] * dim, "size": [1.0, 1.0, 0.5][:dim], "cells": cells}
     sheet = {"origin": [0.0437, foot, 0.0][:dim], "size": [0.006, 1.0 - foot, 0.5][:dim], "cells": [1, 8, 2][:dim]}
     held = [{"where": side, "fix": ["x", "y", "z"][:dim]} for side in ("bottom", "top")]

@@ -164,19 +164,19 @@ def cut(
     integrals = patches.integrals
     patches = Patches(*(part[order] for part in patches._replace(integrals=integrals[:, :0])))
     opening = _open_faces(sums, count.reshape(shape), base)
-    inner, _ = _box_cells(patches.cell, frame, lo, hi)
+    inner, cell = _box_cells(patches.cell, frame, lo, hi)
     box, beyond = Box(frame.lo, shape, images, lo, hi), neighbours(facets, len(x), seams, lattice.cells)
     pieces = find_pieces(x, facets, beyond, box, patches, inner, opening, frame)
     for fraction in opening:
         np.maximum(fraction, 0.0, out=fraction)
-    integrals = integrals[order]
     patch_piece = pieces.patch_piece
     if pieces.rest is not None:
-        patches, integrals, patch_piece, remnant = _replaced(patches, integrals, patch_piece, pieces.rest)
+        patches, integrals, patch_piece, remnant = _replaced(patches, integrals[order], patch_piece, pieces.rest)
+        order = np.arange(len(integrals))
+        inner, cell = _box_cells(patches.cell, frame, lo, hi)
     volume = _volumes(patches, frame, opening[-1])
-    inner, cell = _box_cells(patches.cell, frame, lo, hi)
     some = np.flatnonzero(inner & np.any(patches.vectors != 0.0, axis=1))
-    integrals = integrals[some]
+    integrals = integrals[order[some]]
     moments = integrals[:, dim:].reshape(-1, dim, dim)
     integrals = integrals[:, :dim]
     if part is not None:
