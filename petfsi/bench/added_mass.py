@@ -40,12 +40,12 @@ BALL_CELLS, QUICK_BALL_CELLS, BALL_OFFSETS = (24, 48), (24,), 2
 DENSITY, RADIUS, CONTAINER, SIZE = 1000.0, 0.4, 1.0, 2.2
 DT, SPEED, YOUNG = 0.1, 1e-3, 1e8
 #: Elements across the body per cell of the grid's axis.
-ELEMENTS_PER_CELL = {2: 0.375, 3: 0.25}
+ELEMENTS_PER_CELL = {2: 0.5, 3: 0.25}
 
 #: Bounds on the exact transfer.
-DISK_ERROR, DISK_ERROR_AT = 0.0025, 64
+DISK_ERROR, DISK_ERROR_AT = 0.002, 64
 DISK_ORDER = 1.6
-BALL_ERROR, BALL_ERROR_AT = 0.02, 48
+BALL_ERROR, BALL_ERROR_AT = 0.013, 48
 
 
 def theoretical(dim: int) -> float:
@@ -130,7 +130,7 @@ def run(case: Case) -> Report:
                 row = _row(case.comm, Body(3, ratio, cells, transfer), BALL_OFFSETS)
                 report.rows.append(row)
                 if transfer == "cutcell" and cells >= BALL_ERROR_AT:
-                    report.demand(row["rms"] < BALL_ERROR, row, f"rms below {BALL_ERROR:.0%}")
+                    report.demand(row["rms"] < BALL_ERROR, row, f"rms below {BALL_ERROR:.1%}")
     report.figure = _picture(report)
     return report
 
