@@ -23,7 +23,7 @@ FALLEN = {8: 0.95, 16: 0.99, 32: 0.995}
 #: The channel is 1 m wide and 4 m high, the body half as wide, twice as dense as the fluid, and falls for a while.
 RADIUS, RATIO, GRAVITY = 0.25, 2.0, 1.0
 HEIGHT, START = {2: 4.0, 3: 3.0}, {2: 3.0, 3: 2.0}
-END, DT = {2: 2.4, 3: 2.0}, 0.01
+END, DT = {2: 2.4, 3: 2.0}, {2: 0.01, 3: 0.02}
 #: Elements across the body.
 ELEMENTS_PER_CELL, FEWEST = {2: 1.25, 3: 0.75}, {2: 8, 3: 12}
 YOUNG = 1e8
@@ -103,7 +103,7 @@ class Fall:
         return {
             "dim": dim,
             "gravity": [0.0, -GRAVITY, 0.0][:dim],
-            "time": {"end": END[dim], "dt": DT * 16 / self.cells, "integrator": self.integrator},
+            "time": {"end": END[dim], "dt": DT[dim] * 16 / self.cells, "integrator": self.integrator},
             "fluid": {"density": 1.0, "origin": [0.0] * dim, "size": size, "cells": [round(across * s) for s in size]},
             "solids": {"body": _ball(dim, centre, RADIUS, elements, RATIO)},
             "probes": {"body": {"of": "body", "at": centre, "quantity": "velocity"}},
