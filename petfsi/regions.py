@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 CLOSE = 1e-11
 #: What sums over a surface leave of a volume, as a part of it.
 ROUND_OFF = 1e-13
+#: Even pressures whose squared force is this part of what they push with by themselves are not felt.
+UNFELT = 1e-14
 #: A volume that changes without its walls by more than this part of a cell, or of itself, has jumped.
 JUMP, SMALL = 0.05, 0.01
 #: Where sources swing, the next volume wanted lags behind their change by a quarter of this: they then shrink by .61
@@ -224,13 +226,43 @@ class ClosedRegions:
         if version == self._attached_for:
             return
         self._attached_for = version
-        rigid = [member for member, elastic in zip(self._members, self._elastic, strict=True) if not elastic]
-        _attach(fluid.block, self._members if self.decoupled else rigid)
+        free = self._unfelt()
+        _attach(fluid.block, self._members if self.decoupled else free)
         if system.index_sets:
-            whole = np.zeros((len(rigid), system.solution.local_size))
-            for row, member in zip(whole, rigid, strict=True):
-                row[system.piece(fluid.name)] = member
+            whole = np.zeros((len(free), system.solution.local_size))
+            for row, values in zip(whole, free, strict=True):
+                row[system.piece(fluid.name)] = values
             _attach(system.operator, list(whole))
+
+    def _unfelt(self) -> list[np.ndarray]:
+        """Return the pressures, even in each region, that no solid feels: an orthogonal set, this rank's part.
+
+        Those of regions with rigid walls alone, and what rooms on two sides of a beam have in common. Collective.
+        """
+        n = len(self._members)
+        if not np.any(self._elastic):
+            return self._members
+        forces = []
+        for coupling in self.system.couplings:
+            block = coupling.blocks[self.solid.name, self.fluid.name]  # type: ignore[union-attr]
+            even, force = block.createVecs()
+            for member in self._members:
+                even.array = member
+                block.mult(even, force)
+                forces.append(force.array_r.copy())
+        pushed = np.array(forces).reshape(-1, n, len(forces[0]))
+        sizes = np.array([[member @ other for other in self._members] for member in self._members])
+        gram, sizes = self.system.comm.allreduce(np.array([np.einsum("ckx,clx->kl", pushed, pushed), sizes]))
+        scale = np.sqrt(np.where(gram.diagonal() > 0.0, gram.diagonal(), 1.0))
+        # in units in which each region alone pushes as hard as the others
+        felt, ways = np.linalg.eigh(gram / np.outer(scale, scale))
+        kernel = ways[:, felt <= UNFELT] / scale[:, None]
+        if not kernel.shape[1]:
+            return []
+        # orthogonal as pressures
+        root = np.sqrt(sizes.diagonal())
+        basis, _ = np.linalg.qr(root[:, None] * kernel)
+        return [np.tensordot(column / root, np.array(self._members), axes=1) for column in basis.T]
 
     # ---- closing their volumes --------------------------------------------------------------------------------
 

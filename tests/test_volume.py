@@ -284,3 +284,23 @@ def test_a_ring_full_of_water_turns_over(ring_of_water):
     assert np.mean(gap[10:]) == pytest.approx(wanted, rel=0.05)
     assert last["elastic"] < 1e-5 * first["kinetic"]
     assert last["energy_residual"] < 0
+
+
+# ---- pressures that nothing feels ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parallel([1, 2])
+def test_two_rooms_on_the_sides_of_a_beam_have_a_pressure_in_common_that_it_does_not_feel():
+    """A beam does not get thinner: it feels the difference alone, and the system is solved all the same."""
+    beam = {"start": [0.0, 0.525], "end": [1.0, 0.525], "thickness": 0.002, "elements": 12, "theory": "euler-bernoulli"}
+    plate = {"shape": {"beam": beam}, "density": 1000.0, "young": 1e12, "poisson": 0.0}
+    plate |= {"supports": [{"where": end, "fix": ["x", "angle"]} for end in ("start", "end")]}
+    plate |= {"initial": {"velocity": ["0", "1e-7*cos(pi*x)"]}}
+    data = scene("bdf2", time={"end": 1.0, "dt": 1e-3}, fluid=fluid((16, 16)), solids={"plate": plate})
+    with prepared(scene_from_dict(data), *DIRECT) as sim:
+        for _ in range(12):
+            sim.advance()
+            assert sim.outcome.residual < 1e-8
+        (unfelt,) = sim.regions._unfelt()
+        assert np.ptp(unfelt[unfelt != 0]) < 1e-12 * np.abs(unfelt).max()
+        assert sim.fluid.volumes()[unfelt == 0].max(initial=0.0) == 0.0
