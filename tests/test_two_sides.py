@@ -169,14 +169,20 @@ def bent(integrator="bdf2"):
     return Scene.model_validate({"dim": 2, "time": time, "fluid": fluid, "solids": {"body": solid}})
 
 
+def same(got, want):
+    """Compare states, but for the pressure's level, which a closed box owes to a stiff strip's last digits."""
+    for name, array in want.items():
+        level = [np.mean(state[name]) if name.startswith("pressure") else 0.0 for state in (got, want)]
+        scale = np.abs(array).max(initial=0.0)
+        np.testing.assert_allclose(got[name] - level[0], array - level[1], rtol=0, atol=1e-7 * scale, err_msg=name)
+
+
 @pytest.mark.parallel([2, 3, 4])
 @pytest.mark.parametrize("integrator", ["newmark", "bdf2"])
 def test_a_strip_bends_alike_on_any_number_of_ranks(integrator):
     states = [stepped(comm, bent(integrator), 10)[1]["pressure"] for comm in (MPI.COMM_SELF, MPI.COMM_WORLD)]
     assert len(states[0]["parts_axis"]) > 40
-    for name in states[0]:
-        scale = np.abs(states[0][name]).max(initial=0.0)
-        np.testing.assert_allclose(states[1][name], states[0][name], rtol=0, atol=1e-7 * scale, err_msg=name)
+    same(states[1], states[0])
 
 
 @pytest.mark.parallel([1, 2])
@@ -198,9 +204,7 @@ def test_both_sides_of_a_strip_come_back_from_a_checkpoint(integrator):
 def test_a_strip_goes_on_alike_on_other_ranks():
     _, whole = stepped(MPI.COMM_SELF, bent(), 6)
     _, parts = stepped(MPI.COMM_WORLD, bent(), 2, stepped(MPI.COMM_SELF, bent(), 4))
-    for name, array in whole["pressure"].items():
-        scale = np.abs(array).max(initial=0.0)
-        np.testing.assert_allclose(parts["pressure"][name], array, rtol=0, atol=1e-7 * scale, err_msg=name)
+    same(parts["pressure"], whole["pressure"])
 
 
 # ---- the plate between two layers -------------------------------------------------------------------------------
