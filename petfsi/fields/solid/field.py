@@ -125,7 +125,8 @@ class NodalSolid(SolidField):
         self._turning: Turning | None = None
         self._shrinkage: Shrinkage | None = None
         parts, body, modulus = self._turning_parts()
-        if self.explicit or not self.comm.allreduce(len(parts)):
+        inertia = np.isfinite(self._integrator.factor(1.0, 0.0))
+        if self.explicit or not inertia or not self.comm.allreduce(len(parts)):
             return
         mine = self._mesh.natural[: self._mesh.n_owned]
         mass = np.stack([self._uniform[a][:, a] for a in range(self.dim)], axis=1)

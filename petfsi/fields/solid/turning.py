@@ -22,7 +22,7 @@ _DIRECT = {
     "ksp_type": "preonly",
     "pc_type": "redundant",
     "redundant_pc_type": "cholesky",
-    "redundant_pc_factor_mat_solver_type": "petsc",
+    "redundant_pc_factor_mat_solver_type": "mumps",
 }
 _ITERATIVE = {"ksp_type": "cg", "ksp_rtol": "1e-10", "ksp_max_it": "200", "pc_type": "gamg"}
 
