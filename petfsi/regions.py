@@ -197,8 +197,8 @@ class ClosedRegions:
             The present regions' volumes at the step's begin, seen from where the step's equations are taken.
         """
         for number, now in zip(self._lasting, begin, strict=True):
-            jump = now - volume[number] if number in volume else 0.0
-            if abs(jump) > min(JUMP * self.fluid.cell_volume, SMALL * now):
+            jump = now - volume.get(number, now)
+            if number in target and abs(jump) > min(JUMP * self.fluid.cell_volume, SMALL * abs(now)):
                 target[number] += jump
 
     def _name_others(self) -> None:

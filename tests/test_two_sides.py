@@ -250,3 +250,28 @@ def test_a_plate_inside_a_cell_swings_with_second_order():
     assert np.log2(steps[0] / steps[1]) == pytest.approx(2.0, abs=0.25), modes
     assert abs(modes[-1]) < 2e-3, modes
     assert np.abs(damping[1:]).max() < 2e-5, damping
+
+
+# ---- sheets beside other things ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parallel([1, 2])
+def test_buoyancy_at_links_that_come_and_go_is_entered():
+    """A box that turns above a strip divides other cells in every step."""
+    scene = {
+        "dim": 2, "gravity": [0.5, -9.81], "time": {"end": 1.0, "dt": 0.01, "integrator": "bdf2"},
+        "fluid": {"density": 1.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [20, 20],
+                  "smoke": {"initial": "where(x>0.5,1,0)", "buoyancy": 0.1},
+                  "sides": {"left": "periodic", "right": "periodic", "top": "open"}},
+        "solids": {"ring": {"shape": {"box": {"origin": [0.42, 0.4], "size": [0.4, 0.4], "cells": [8, 8]}},
+                            "density": 2.0, "young": 2000.0, "poisson": 0.3,
+                            "initial": {"velocity": ["-3*(y-0.6)", "3*(x-0.62)"]}}},
+        "obstacles": {"strip": {"shape": {"box": {"origin": [0.0, 0.27], "size": [0.45, 0.002]}}}},
+    }  # fmt: skip
+    with simulation(MPI.COMM_WORLD, Scene.model_validate(scene), "monolithic.opts") as sim:
+        tables = set()
+        for _ in range(6):
+            sim.advance()
+            tables.add(len(sim.fluid.sheets.table))
+            assert np.all(np.isfinite(list(sim.accounts.values.values())))
+        assert len(tables) > 1

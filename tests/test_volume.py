@@ -304,3 +304,14 @@ def test_two_rooms_on_the_sides_of_a_beam_have_a_pressure_in_common_that_it_does
         (unfelt,) = sim.regions._unfelt()
         assert np.ptp(unfelt[unfelt != 0]) < 1e-12 * np.abs(unfelt).max()
         assert sim.fluid.volumes()[unfelt == 0].max(initial=0.0) == 0.0
+
+
+def test_a_sheet_that_runs_into_a_side_stops_by_name():
+    """Regions part and join as its steps are taken again; overlapping walls leave less than nothing between them."""
+    beam = {"start": [0.2, 0.3], "end": [0.2, 0.7], "thickness": 0.004, "elements": 6}
+    sheet = {"shape": {"beam": beam}, "density": 1000.0, "young": 1e9, "poisson": 0.3}
+    sheet |= {"initial": {"velocity": ["-2.0", "0.3"]}}
+    data = scene("bdf2", fluid=fluid((16, 16)) | {"density": 1.0}, solids={"sheet": sheet})
+    with prepared(scene_from_dict(data)) as sim, pytest.raises(SolveError):
+        for _ in range(60):
+            sim.advance()

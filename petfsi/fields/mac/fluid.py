@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -384,7 +385,12 @@ class MacFluid(CoveredGrid):
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
         gravity = 0.0
         if self._forces is not None:
-            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self.extras, self._forces)
+            forces = self._forces
+            if forces.smoke is not None:  # links may have changed since they were pushed
+                local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
+                now = None if local is None else local.at_cells(forces.smoke, self.smoke_parts)
+                forces = replace(forces, link_smoke=now)
+            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
         into = budget.inflow(
             self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight
         )  # fmt: skip
