@@ -83,6 +83,14 @@ def solved(scene, options, *more, comm=MPI.COMM_WORLD, steps=1):
     with only_options(["-options_file", options, *more]):
         sim = Simulation(comm, scene)
         sim.prepare()
+        sim.counts, solve = [], sim.solver.solve_linear
+
+        def counted(*args, **more):
+            iterations, norms = solve(*args, **more)
+            sim.counts.append(iterations)
+            return iterations, norms
+
+        sim.solver.solve_linear = counted
         for _ in range(steps):
             sim.advance()
         values = dict(zip((f.name for f in sim.fields), sim.system.values(), strict=True))
@@ -102,10 +110,9 @@ def test_iterations_stay_bounded_whatever_the_material(rho, r, most):
 
 
 def test_iterations_do_not_grow_with_the_grid():
-    counts = []
+    counts, case = [], Case(MPI.COMM_SELF, True)
     for n in (16, 32, 48):
-        scene = falling_bar(Case(MPI.COMM_SELF, True), n, 1.0, 1e2, 0.01)
-        counts.append(solved(scene, DEFAULT, "-fsi_ksp_rtol", "1e-8")[0].iterations)
+        counts.append(first_solve(case, falling_bar(case, n, 1.0, 1e2, 0.01), DEFAULT)["iterations"])
     assert max(counts) - counts[0] <= 4, counts
 
 
@@ -153,7 +160,8 @@ def test_rigid_and_elastic_cavities_are_solved_as_a_factorisation_does(wall, hol
     scene = regions_scene(wall, hollow, top)
     outcome, ours, sim = solved(scene, DEFAULT, steps=2)
     _, theirs, _ = solved(scene, DIRECT, steps=2)
-    assert outcome.residual <= 1e-8 and outcome.iterations <= 40
+    # a step takes several solves, to close the volume
+    assert outcome.residual <= 1e-8 and len(sim.counts) > 2 and max(sim.counts) <= 40
     speed = np.abs(theirs["solid"]).max(initial=0.0)
     np.testing.assert_allclose(ours["solid"], theirs["solid"], atol=1e-6 * MPI.COMM_WORLD.allreduce(speed, MPI.MAX))
     rigid = [members for members, touched in sim.fluid.closed_regions(sim.couplings[0].touched) if not touched]
