@@ -15,16 +15,11 @@ from petfsi.fields.solid.rotations import IN_PLACE, ONWARD, SETTING_OUT, Gradien
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.petsc import IntType, new_block, set_csr
 
-#: More nodes than this are solved for by iterations rather than by a factorisation.
+#: More nodes than this are solved for with multigrid.
 MANY = 20_000
 PREFIX = "turning_"
-_DIRECT = {
-    "ksp_type": "preonly",
-    "pc_type": "redundant",
-    "redundant_pc_type": "cholesky",
-    "redundant_pc_factor_mat_solver_type": "mumps",
-}
-_ITERATIVE = {"ksp_type": "cg", "ksp_rtol": "1e-10", "ksp_max_it": "200", "pc_type": "gamg"}
+_SMALL = {"ksp_type": "cg", "ksp_rtol": "1e-14", "ksp_max_it": "5000", "pc_type": "jacobi"}
+_LARGE = {"ksp_type": "cg", "ksp_rtol": "1e-10", "ksp_max_it": "200", "pc_type": "gamg"}
 
 
 class Turning:
@@ -169,7 +164,7 @@ class _Laplace:
         self._ksp.setOptionsPrefix(PREFIX)
         self._ksp.setOperators(self._matrix)
         options = PETSc.Options(PREFIX)
-        chosen = _DIRECT if mesh.nodes.n_global <= MANY else _ITERATIVE
+        chosen = _SMALL if mesh.nodes.n_global <= MANY else _LARGE
         for name, value in chosen.items():
             options.setValue(name, value)
         self._ksp.setFromOptions()
