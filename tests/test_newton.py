@@ -222,7 +222,7 @@ def run(name, dt, n, fails=(), *sets):
 @pytest.mark.parametrize("name, transfer", [("bar2d", "cutcell"), ("bar2d", "ray"), ("sheet", "cutcell"),
                                             ("tank", "cutcell"), ("beam", "cutcell")])  # fmt: skip
 def test_a_step_taken_again_leaves_no_trace(name, transfer, integrator):
-    """Bit for bit as if the scene had asked for the shorter steps."""
+    """Bit for bit as if the scene had asked for the shorter steps; on ranks, where MUMPS sums in no order, alike."""
     h = 1 / 32 if name in ("bar2d", "tank") else 1 / 128
     sets = (f"time.integrator={integrator}", f"coupling.transfer={transfer}")
     again, substeps = run(f"{name}.toml", f"{h}", 4, (3, 5), *sets)
@@ -233,7 +233,9 @@ def test_a_step_taken_again_leaves_no_trace(name, transfer, integrator):
     assert again.time == asked.time
     for field, arrays in asked.state().items():
         for key, slab in arrays.items():
-            assert np.array_equal(slab.data, again.state()[field][key].data), (field, key)
+            other = again.state()[field][key].data
+            slack = 0.0 if asked.comm.size == 1 else 1e-9 * np.abs(slab.data).max(initial=0.0)
+            np.testing.assert_allclose(other, slab.data, rtol=0, atol=slack, err_msg=f"{field} {key}")
 
 
 def test_a_step_is_halved_no_more_often_than_the_scene_says():
