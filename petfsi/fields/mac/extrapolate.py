@@ -12,6 +12,8 @@ from petfsi.fields.mac.grid import MacGrid
 LAYERS = 6
 #: Layers between two exchanges; ghosts are worked on redundantly, each layer spoiling two from outside.
 BATCH = 2
+#: Layers that are extrapolated along lines.
+LINEAR = 2
 #: The layer of entries that no layer reaches, and of those outside the domain.
 FAR = 255
 
@@ -68,14 +70,19 @@ def _extrapolate(q, layer, entries, strides):
     """Set entries of one layer to the mean of what lines through their neighbours in lower ones say.
 
     A line needs a second entry behind the neighbour that is known no later than it; else the neighbour's value goes on.
+    So it does beyond ``LINEAR`` layers, and no value is larger than half as much again as those it comes from: lines
+    through lines would grow without bound.
     """
     for entry in entries:
         total, count = 0.0, 0
         for stride in strides:
             for s in (-stride, stride):
                 if layer[entry + s] < layer[entry]:
-                    straight = layer[entry + 2 * s] <= layer[entry + s]
-                    total += 2.0 * q[entry + s] - q[entry + 2 * s] if straight else q[entry + s]
+                    near, value = q[entry + s], q[entry + s]
+                    if layer[entry] <= LINEAR and layer[entry + 2 * s] <= layer[entry + s]:
+                        most = 1.5 * max(abs(near), abs(q[entry + 2 * s]))
+                        value = min(max(2.0 * near - q[entry + 2 * s], -most), most)
+                    total += value
                     count += 1
         q[entry] = total / count
 
