@@ -93,15 +93,16 @@ def power(
 
 def inflow(
     grid: MacGrid, density: float, velocity: Faces, kind: list[np.ndarray], openness: list[np.ndarray],
-    pressure: np.ndarray, active: np.ndarray, weight: Weight | None,
+    pressure: np.ndarray, active: np.ndarray, weight: Weight | None, extras: Extras | None, further: np.ndarray,
 ) -> float:  # fmt: skip
     """Return this rank's share of the power that comes through the sides, W. Not collective.
 
     Through jets and open sides,  sum_f q_f (p_f + rho |v|^2 / 2)  with the volume q_f that comes in a second. The
     velocity across a face is its own, that along it the one of the cell inside. Where the pressure of the fluid at
-    rest is split off (``weight``), p is without it: this adds the potential energy of what comes and goes.
+    rest is split off (``weight``), p is without it: this adds the potential energy of what comes and goes. Of divided
+    cells, ``further`` are the pressures of the further pieces.
     """
-    total = 0.0
+    total = 0.0 if extras is None else _inflow_of_parts(grid, density, velocity, pressure, weight, extras, further)
     for a in range(grid.dim):
         for upper in (False, True):
             edge = (grid.hi[a] == grid.cells[a]) if upper else (grid.lo[a] == 0)
@@ -121,6 +122,36 @@ def inflow(
                 p = p - np.where(is_open, _rest(grid, weight, a, at), _rest(grid, weight, None, cell))
             flow = np.where(is_open | is_wall, (-v if upper else v) * openness[a][at], 0.0) * grid.face_area(a)
             total += float(np.sum(flow * (p + 0.5 * density * (v**2 + _along(velocity, cell, a)))))
+    return total
+
+
+def _inflow_of_parts(
+    grid: MacGrid, density: float, velocity: Faces, pressure: np.ndarray, weight: Weight | None, extras: Extras,
+    further: np.ndarray,
+) -> float:  # fmt: skip
+    """Return what divided faces of open sides let in, and those with a given flow beyond what whole ones would, W."""
+    area = np.array([grid.face_area(a) for a in range(grid.dim)])
+    given = extras.inlets
+    excess = further[given.piece - grid.layout.n_local] - grid.to_vec(pressure)[given.cell]
+    total = float(given.flow(velocity, area) @ excess)
+    links = np.flatnonzero(extras.owned & ((extras.below < 0) | (extras.above < 0)))
+    for a in range(grid.dim):
+        row = links[extras.axis[links] == a]
+        if not len(row):
+            continue
+        face, upper = np.array(np.unravel_index(extras.face[row], grid.shape(a))), extras.above[row] < 0
+        v = velocity.parts[extras.row[row]]
+        flow = np.where(upper, -v, v) * extras.openness[row] * area[a]
+        rest = np.zeros(len(row))
+        if weight is not None:
+            rest = weight.on([line.reshape(-1)[i] for line, i in zip(grid.lines(a), face, strict=True)])
+        along = np.zeros(len(row))
+        cell = face - upper * (np.arange(3) == a)[:, None]
+        for b in range(grid.dim):
+            if b != a:
+                above = cell + (np.arange(3) == b)[:, None]
+                along += 0.5 * (velocity[b][tuple(cell)] ** 2 + velocity[b][tuple(above)] ** 2)
+        total += float(flow @ (0.5 * density * (v**2 + along) - rest))
     return total
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from petfsi.fields.mac.advect import keep_own, sweep
+from petfsi.fields.mac.extrapolate import LINEAR, on_line
 from petfsi.fields.mac.kinds import DEAD, NARROW, PRESSURE, SPLIT
 
 #: Layers of entries not reached: narrow parts of divided faces, unknown yet, and beyond the sides of the domain.
@@ -36,8 +37,8 @@ class Cut(NamedTuple):
         Kinds and first links again, one axis after the other.
     extra : ndarray of int32
         Cell array: row of piece 1 of a divided cell, else -1.
-    fluid : ndarray of bool
-        Cell array.
+    fluid, given : ndarray of bool
+        Cell arrays; beyond the sides, where a jet says what smoke comes in.
     ends : ndarray of int64, shape (n_links,)
         Where the links of a link's face end.
     below, above : ndarray of int64, shape (n_links,)
@@ -56,6 +57,7 @@ class Cut(NamedTuple):
     firsts: np.ndarray
     extra: np.ndarray
     fluid: np.ndarray
+    given: np.ndarray
     ends: np.ndarray
     below: np.ndarray
     above: np.ndarray
@@ -296,8 +298,8 @@ def fill_cells(cut, base, pick, values, extras, q, layer, todo):
 def extend(q, layer, dim, linear, todo, left):
     """Give entries that are not known the values of their neighbours in lower layers, layer by layer.
 
-    An entry takes the mean over the directions in which such a neighbour lies: 2 q_1 - q_2 if ``linear`` and the
-    neighbour's neighbour is in no higher layer than it, else q_1.
+    An entry takes the mean over the directions in which such a neighbour lies: what the line through it says if
+    ``linear``, as in ``extrapolate.Band``, and the neighbour's neighbour is in no higher layer than it, else its value.
 
     Parameters
     ----------
@@ -322,8 +324,8 @@ def extend(q, layer, dim, linear, todo, left):
                     one = at + step
                     if layers[one] < number:
                         value = values[one]
-                        if linear and layers[one + step] <= layers[one]:
-                            value = 2.0 * value - values[one + step]
+                        if linear and number <= LINEAR and layers[one + step] <= layers[one]:
+                            value = on_line(value, values[one + step])
                         total += value
                         count += 1
             if count > 0:
@@ -353,7 +355,10 @@ def clamp_faces(cut, a, base, q, layer):
 
 @njit(cache=True)
 def clamp_cells(cut, base, pick, values, q, layer):
-    """Give cells beyond the sides what the grid has there, or where the chart differs what that has next to them."""
+    """Give cells beyond the sides what the grid has there, or where the chart differs what that has next to them.
+
+    What jets carry in is the same for all pieces.
+    """
     deep = MARGIN if cut.dim == 3 else 0
     for i in range(MARGIN, q.shape[0] - MARGIN):
         for j in range(MARGIN, q.shape[1] - MARGIN):
@@ -364,8 +369,9 @@ def clamp_cells(cut, base, pick, values, q, layer):
                         min(max(j, cut.low[1] - base[1]), cut.high[1] - base[1] - 1),
                         min(max(k, cut.low[2] - base[2]), cut.high[2] - base[2] - 1),
                     )
+                    c = (base[0] + i, base[1] + j, base[2] + k)
                     plain = pick[w] == 0 and cut.extra[base[0] + w[0], base[1] + w[1], base[2] + w[2]] < 0
-                    q[i, j, k] = values[base[0] + i, base[1] + j, base[2] + k] if plain else q[w]
+                    q[i, j, k] = values[c] if plain or cut.given[c] else q[w]
 
 
 @njit(cache=True)

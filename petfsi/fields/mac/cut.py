@@ -13,7 +13,7 @@ order. See ``slivers`` for what makes it second.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
@@ -88,6 +88,10 @@ class Links:
     openness: np.ndarray
     split: np.ndarray
 
+    def where(self, chosen: np.ndarray) -> Links:
+        """Return some of them."""
+        return Links(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
 
 def links_of(cut: CutCells, shape: tuple[int, ...]) -> Links:
     """Return the links of all faces next to a surface. Not collective.
@@ -115,7 +119,7 @@ def links_of(cut: CutCells, shape: tuple[int, ...]) -> Links:
         )  # fmt: skip
     parts = [np.concatenate(c) for c in zip(*columns, strict=True)]
     keep = parts[4] > 0.0
-    return Links(*(part[keep] for part in parts))
+    return Links(*parts).where(keep)
 
 
 def walls_of(cut: CutCells, slot: np.ndarray, n_moving: int) -> Walls:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -10,7 +10,7 @@ from numba import njit
 
 from petfsi.fields.mac import kinds
 from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, links_of, patch_slots, walls_of
-from petfsi.fields.mac.extras import Extras
+from petfsi.fields.mac.extras import Extras, Inlets
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.parts import Parts, global_index, owned
 from petfsi.fields.mac.sides import Surroundings
@@ -132,11 +132,13 @@ class CutGrid:
             seams = find_seams(points, facets, grid.size, np.array(grid.periodic[: grid.dim]))
         n_points, n_moving = len(points), len(seams.walls)
         points = seams.closed(points, grid.size, grid.dx)
-        every = np.concatenate((points, still.points)), np.concatenate((facets, still.facets + n_points))
+        surface = np.concatenate((points, still.points)), np.concatenate((facets, still.facets + n_points))
         if part is not None:
             part = np.concatenate((part, np.full(len(still.facets), -1, dtype=part.dtype)))
-        found = cut(*every, self.lattice, still.base, part, together(seams, still.seams, n_points, len(facets)))
-        links = self._without_walls(links_of(found, self.shape))
+        found = cut(*surface, self.lattice, still.base, part, together(seams, still.seams, n_points, len(facets)))
+        every = links_of(found, self.shape)
+        shut = self._through_walls(every)
+        links = every.where(~shut)
         slot = patch_slots(found, len(self._flat))
         walls = walls_of(found, slot, n_moving)
         whole = self._whole_openings(found)
@@ -145,7 +147,7 @@ class CutGrid:
         self._part(volume, None)[...] = found.volume
         grid.exchange_cells(volume)
         cell_kind, face_kind = self._kinds(openness, split)
-        layout, index, extras, parts, numbers = self._number(found, links)
+        layout, index, extras, parts, numbers = self._number(found, links, every.where(shut))
         active = cell_kind.reshape(-1)[self._flat] == kinds.FLUID
         solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
@@ -202,13 +204,13 @@ class CutGrid:
         index = np.stack(np.unravel_index(cell, self.shape), axis=1) + self.lattice.lo
         return (index + 0.5) * grid.dx - grid.size
 
-    def _without_walls(self, links: Links) -> Links:
-        """Drop the links through sides that no pressure acts on: those faces are just as open as they are."""
-        keep = np.ones(len(links.axis), dtype=bool)
+    def _through_walls(self, links: Links) -> np.ndarray:
+        """Return which links go through sides that no pressure acts on: those faces are just as open as they are."""
+        shut = np.zeros(len(links.axis), dtype=bool)
         for a, kind in enumerate(self._sides):
             beyond = np.flatnonzero((links.axis == a) & ((links.below < 0) | (links.above < 0)))
-            keep[beyond] = kind.reshape(-1)[links.face[beyond]] == kinds.OPEN
-        return Links(*(getattr(links, f.name)[keep] for f in fields(links)))
+            shut[beyond] = kind.reshape(-1)[links.face[beyond]] != kinds.OPEN
+        return shut
 
     def _kinds(self, openness: list[np.ndarray], split: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Return the kinds of cells and faces. Collective."""
@@ -237,7 +239,9 @@ class CutGrid:
             found.append(narrow)
         return found
 
-    def _number(self, found: CutCells, links: Links) -> tuple[Layout, np.ndarray, Extras | None, Parts, np.ndarray]:
+    def _number(
+        self, found: CutCells, links: Links, through_walls: Links
+    ) -> tuple[Layout, np.ndarray, Extras | None, Parts, np.ndarray]:
         """Return layout, cell numbers, extras, parts, and the global number of each slot. Collective."""
         grid = self.grid
         had_parts, self.had_parts = self.had_parts, True
@@ -262,7 +266,19 @@ class CutGrid:
         numbers = np.concatenate((index.reshape(-1)[self._flat].astype(np.int64), extra))
         pieces = local[mine], found.extra_piece[mine], found.extra_volume[mine]
         parts, columns = self._split_links(found, links, numbers)
-        return layout, index, Extras(*pieces, *columns), parts, numbers
+        inlets = self._inlets(found, through_walls, numbers - layout.start)
+        return layout, index, Extras(inlets, *pieces, *columns), parts, numbers
+
+    def _inlets(self, found: CutCells, links: Links, local: np.ndarray) -> Inlets:
+        """Return what sides with a given velocity let into further pieces; ``local`` are the slots' local numbers."""
+        slot, n_box = np.maximum(links.below, links.above), len(self._own)
+        own = np.concatenate((self._own, self._own[found.extra_cell]))
+        use = np.flatnonzero((slot >= n_box) & own[slot])
+        slot, axis, face = slot[use], links.axis[use], np.empty(len(use), dtype=np.int64)
+        for a, faces in enumerate(self._flat_faces):
+            face[axis == a] = faces[links.face[use[axis == a]]]
+        inward = np.where(links.below[use] < 0, 1.0, -1.0) * links.openness[use]
+        return Inlets(local[slot], local[found.extra_cell[slot - n_box]], axis, face, inward)
 
     def _split_links(self, found: CutCells, links: Links, numbers: np.ndarray) -> tuple[Parts, tuple[np.ndarray, ...]]:
         """Return all ranks' parts, and what ``Extras`` says of links, in the same order on any ranks. Collective."""

@@ -66,22 +66,30 @@ def _average(q, layer, entries, strides):
 
 
 @njit(cache=True)
+def on_line(near, far):
+    """Return what comes after ``near`` on the line from ``far`` through it, within half as much again as the two.
+
+    Lines through lines would grow without bound.
+    """
+    most = 1.5 * max(abs(near), abs(far))
+    return min(max(2.0 * near - far, -most), most)
+
+
+@njit(cache=True)
 def _extrapolate(q, layer, entries, strides):
     """Set entries of one layer to the mean of what lines through their neighbours in lower ones say.
 
     A line needs a second entry behind the neighbour that is known no later than it; else the neighbour's value goes on.
-    So it does beyond ``LINEAR`` layers, and no value is larger than half as much again as those it comes from: lines
-    through lines would grow without bound.
+    So it does beyond ``LINEAR`` layers.
     """
     for entry in entries:
         total, count = 0.0, 0
         for stride in strides:
             for s in (-stride, stride):
                 if layer[entry + s] < layer[entry]:
-                    near, value = q[entry + s], q[entry + s]
+                    value = q[entry + s]
                     if layer[entry] <= LINEAR and layer[entry + 2 * s] <= layer[entry + s]:
-                        most = 1.5 * max(abs(near), abs(q[entry + 2 * s]))
-                        value = min(max(2.0 * near - q[entry + 2 * s], -most), most)
+                        value = on_line(value, q[entry + 2 * s])
                     total += value
                     count += 1
         q[entry] = total / count

@@ -14,11 +14,43 @@ from petfsi.petsc import IntType, Layout
 
 
 @dataclass(frozen=True)
+class Inlets:
+    """Parts of faces on sides with a given velocity that let fluid into further pieces of this rank's cells.
+
+    The grid's own rows give a whole face's flow to the first piece of its cell.
+
+    Attributes
+    ----------
+    piece, cell : ndarray of int, shape (n,)
+        Local numbers of the unknowns of the piece and of its cell.
+    axis, face : ndarray of int, shape (n,)
+        The face: flat index in the local face array.
+    inward : ndarray, shape (n,)
+        The part's fraction of the face; negative at upper sides, where what flows along the axis goes out.
+    """
+
+    piece: np.ndarray
+    cell: np.ndarray
+    axis: np.ndarray
+    face: np.ndarray
+    inward: np.ndarray
+
+    def flow(self, given: list[np.ndarray], areas: np.ndarray) -> np.ndarray:
+        """Return what comes in through each part at the given velocities of faces, m^3/s (m^2/s in 2D)."""
+        speed = np.zeros(len(self.axis))
+        for a, velocity in enumerate(given):
+            at = self.axis == a
+            speed[at] = velocity.reshape(-1)[self.face[at]]
+        return areas[self.axis] * self.inward * speed
+
+
+@dataclass(frozen=True)
 class Extras:
     """The second and further unknowns of split cells, which follow a rank's cells in the layout, and their links.
 
     Attributes
     ----------
+    inlets : Inlets
     cell : ndarray of int, shape (n_owned,)
         Flat index in the local array of the cell that each of this rank's extra unknowns lies in.
     piece : ndarray of int, shape (n_owned,)
@@ -39,6 +71,7 @@ class Extras:
         Whether the face is this rank's own.
     """
 
+    inlets: Inlets
     cell: np.ndarray
     piece: np.ndarray
     volume: np.ndarray
@@ -116,8 +149,24 @@ class Extras:
         total.sort_indices()
         return total.indptr.astype(IntType), total.indices.astype(IntType), total.data
 
-    def add_inflow(self, star: np.ndarray, areas: np.ndarray, layout: Layout, out: np.ndarray) -> None:
-        """Add minus the net outflow through the links, by their velocities, to this rank's right-hand side."""
+    def add_inflow(
+        self, star: np.ndarray, given: list[np.ndarray], areas: np.ndarray, layout: Layout, out: np.ndarray
+    ) -> None:
+        """Add what comes in through the links, by their velocities, to this rank's right-hand side.
+
+        Parameters
+        ----------
+        star : ndarray
+            Velocities of links.
+        given : list of ndarray
+            Face arrays: those of the sides.
+        areas : ndarray, shape (dim,)
+        layout : Layout
+        out : ndarray, shape (layout.n_local,)
+        """
+        let_in = self.inlets.flow(given, areas)
+        np.add.at(out, self.inlets.piece, let_in)
+        np.subtract.at(out, self.inlets.cell, let_in)
         flux = areas[self.axis] * self.openness * star[self.row]
         for number, mine, sign in ((self.below, self.mine_below, -1.0), (self.above, self.mine_above, 1.0)):
             np.add.at(out, number[mine] - layout.start, sign * flux[mine])

@@ -100,8 +100,7 @@ class MacFluid(CoveredGrid):
             self._complete_cells(self.smoke)
         self._transport.carried = self._extend(self.velocity)
         if self.sheets is not None:
-            assert self.narrow is not None
-            whole = Sheets(self.grid, Parts.none(), self.face_kind, self.narrow, self.cell_kind)
+            whole = self._sheets_of(Parts.none())
             self._go_on(Lineage(self.grid, whole, self.sheets, self.face_kind))
 
     def _evaluate(self, text: Number, key: str, array: np.ndarray, axis: int | None) -> None:
@@ -140,11 +139,15 @@ class MacFluid(CoveredGrid):
     def _divide(self, parts: Parts, old_kind: list[np.ndarray]) -> None:
         """Let divided faces and cells go on with what those had that they come from. Collective."""
         old, grid = self.sheets, self.grid
-        assert self.narrow is not None
-        self.sheets = Sheets(grid, parts, self.face_kind, self.narrow, self.cell_kind)
+        self.sheets = self._sheets_of(parts)
         self._transport.advection.sheets = self.sheets
         if old is not None and (len(parts) or len(old.table)):
             self._go_on(Lineage(grid, old, self.sheets, old_kind))
+
+    def _sheets_of(self, parts: Parts) -> Sheets:
+        assert self.narrow is not None
+        behind = self.surroundings.behind_jets
+        return Sheets(self.grid, parts, self.face_kind, self.narrow, self.cell_kind, behind)
 
     def _go_on(self, lineage: Lineage) -> None:
         """Take over velocities and smoke of the former parts. Collective."""
@@ -361,7 +364,7 @@ class MacFluid(CoveredGrid):
                 kinds.STEP[axis], areas[axis], self._part(None), inflow,
             )  # fmt: skip
         if self.extras is not None:
-            self.extras.add_inflow(velocity.parts, areas, self.layout, inflow)
+            self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
         return -inflow
 
     def _outflow_of(self, unknowns: np.ndarray, velocity: Faces) -> np.ndarray:
@@ -377,7 +380,7 @@ class MacFluid(CoveredGrid):
             )  # fmt: skip
         inflow[cells] = through
         if self.extras is not None:
-            self.extras.add_inflow(velocity.parts, areas, self.layout, inflow)
+            self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
         return -inflow[unknowns]
 
     def work(self, dt: float) -> Work:
@@ -392,7 +395,8 @@ class MacFluid(CoveredGrid):
                 forces = replace(forces, link_smoke=now)
             gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
         into = budget.inflow(
-            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight
+            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.extras,
+            self._extra_pressure,
         )  # fmt: skip
         return Work(gravity=gravity, boundary=dt * into)
 
@@ -452,8 +456,7 @@ class MacFluid(CoveredGrid):
 
     def _restore_parts(self, read: Reader) -> None:
         """Take back divided cells and faces, and what is on them; kinds are back already. Collective."""
-        assert self.narrow is not None
-        self.sheets = Sheets(self.grid, Parts.restored(read), self.face_kind, self.narrow, self.cell_kind)
+        self.sheets = self._sheets_of(Parts.restored(read))
         self._transport.advection.sheets = self.sheets
         assert self._cutter is not None
         self._cutter.had_parts = len(self.sheets.table) > 0

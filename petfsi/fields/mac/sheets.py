@@ -29,6 +29,8 @@ class Sheets:
         Face arrays, valid in all ghosts.
     cell_kind : ndarray
         Cell array, the same.
+    given : ndarray of bool
+        Cell array: beyond the sides, where a jet says what smoke comes in.
 
     Attributes
     ----------
@@ -38,13 +40,13 @@ class Sheets:
 
     def __init__(
         self, grid: MacGrid, table: Parts, face_kind: list[np.ndarray], narrow: list[np.ndarray],
-        cell_kind: np.ndarray,
+        cell_kind: np.ndarray, given: np.ndarray,
     ) -> None:  # fmt: skip
         self.grid, self.table = grid, table
         self.local = LocalParts(grid, table)
         inside = grid.inside(None)
         self._low, self._high = (np.array([getattr(s, end) for s in inside]) for end in ("start", "stop"))
-        self._fluid, self._kind, self._narrow = cell_kind == kinds.FLUID, face_kind, narrow
+        self._fluid, self._kind, self._narrow, self._given = cell_kind == kinds.FLUID, face_kind, narrow, given
         thin = charts.thin_walls(three(face_kind), self._fluid, self._low, self._high, grid.dim, THICKEST)
         self._near = thin | (self.local.extra >= 0) if len(table) else thin
         #: Whether there is any sheet near this rank.
@@ -59,8 +61,8 @@ class Sheets:
         table, local = self.table, self.local
         return charts.Cut(
             three(self._kind), three(self._narrow), three(local.first), _flat(self._kind), _flat(local.first),
-            local.extra, self._fluid, table.first[1:][local.number], table.below, table.above, table.openness,
-            self._low, self._high, self.grid.dim,
+            local.extra, self._fluid, self._given, table.first[1:][local.number], table.below, table.above,
+            table.openness, self._low, self._high, self.grid.dim,
         )  # fmt: skip
 
     def _ends(self) -> np.ndarray:

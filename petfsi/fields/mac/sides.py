@@ -90,13 +90,13 @@ class Jet:
         speed = evaluate_at(self._speed, self.points, time)
         self.value[:] = (-1.0 if self.upper else 1.0) * ramp(time, self.spec.ramp) * speed
 
-    def fill_smoke(self, smoke: np.ndarray) -> None:
-        """Give the ghosts behind the jet the smoke that it carries in."""
-        view = np.moveaxis(smoke, self.axis, 0)
+    def fill_behind(self, cells: np.ndarray, value: float | bool) -> None:
+        """Give the ghosts behind the jet a value."""
+        view = np.moveaxis(cells, self.axis, 0)
         across = tuple(f for b, f in enumerate(self.faces) if b != self.axis)
         if len(across[0]):
             first = self.faces[self.axis][0]
-            view[(slice(first, None) if self.upper else slice(0, first), *across)] = self.spec.smoke
+            view[(slice(first, None) if self.upper else slice(0, first), *across)] = value
 
 
 class Surroundings:
@@ -112,6 +112,8 @@ class Surroundings:
         Those that this rank sees.
     has_jets : bool
         Whether any rank sees any.
+    behind_jets : ndarray of bool
+        Cell array: ghosts that hold the smoke that a jet carries in.
     """
 
     def __init__(self, grid: MacGrid, sides: Sides):
@@ -125,6 +127,9 @@ class Surroundings:
             for upper, name in enumerate(NAMES[axis]):
                 if not grid.periodic[axis]:
                     self._set_side(getattr(sides, name), name, axis, bool(upper))
+        self.behind_jets = np.zeros(grid.shape(None), dtype=bool)
+        for jet in self.jets:
+            jet.fill_behind(self.behind_jets, True)
 
     def _set_side(self, side: Side, name: str, axis: int, upper: bool) -> None:
         """Enter one side; ranks that do not see it enter nothing."""
@@ -180,7 +185,7 @@ class Surroundings:
         """Fill the ghosts beyond the sides: as inside, but behind a jet what it carries."""
         self.grid.fill_sides(smoke, None)
         for jet in self.jets:
-            jet.fill_smoke(smoke)
+            jet.fill_behind(smoke, jet.spec.smoke)
 
 
 def _covered_cells(grid: MacGrid, shape: Shape, key: str, directory: Path) -> np.ndarray:
