@@ -134,6 +134,21 @@ def velocity_at(u, v, w, s0, s1, s2, flat):
     return a, b, c
 
 
+@njit(cache=True, inline="always")
+def track_back(u, v, w, s0, s1, s2, courant, low, high, reach, flat):
+    """Return the middle and the begin of the path that ends at a point; see ``sweep``, whose arguments these are."""
+    c0, c1, c2 = courant
+    a, b, c = velocity_at(u, v, w, s0, s1, s2, flat)
+    m0 = _clamp(s0 - 0.5 * c0 * a, low[0], high[0])
+    m1 = _clamp(s1 - 0.5 * c1 * b, low[1], high[1])
+    m2 = _clamp(s2 - 0.5 * c2 * c, low[2], high[2])
+    a, b, c = velocity_at(u, v, w, m0, m1, m2, flat)
+    d0 = _clamp(s0 - c0 * a, low[0] - reach, high[0] + reach)
+    d1 = _clamp(s1 - c1 * b, low[1] - reach, high[1] + reach)
+    d2 = _clamp(s2 - c2 * c, low[2] - reach, high[2] + reach)
+    return (m0, m1, m2), (d0, d1, d2)
+
+
 @njit(cache=True)
 def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic, bounded):
     """Advect q by one step into ``out`` on a part of the grid.
@@ -163,7 +178,6 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
     """
     flat = q.shape[2] == 1
     (b0, e0), (b1, e1), (b2, e2) = part
-    c0, c1, c2 = courant
     h0, h1, h2 = offset
     for i in range(b0, e0):
         for j in range(b1, e1):
@@ -172,14 +186,7 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
                     out[i, j, k] = q[i, j, k]
                     continue
                 s0, s1, s2 = i + h0, j + h1, k + h2
-                a, b, c = velocity_at(u, v, w, s0, s1, s2, flat)
-                m0 = _clamp(s0 - 0.5 * c0 * a, low[0], high[0])
-                m1 = _clamp(s1 - 0.5 * c1 * b, low[1], high[1])
-                m2 = _clamp(s2 - 0.5 * c2 * c, low[2], high[2])
-                a, b, c = velocity_at(u, v, w, m0, m1, m2, flat)
-                d0 = _clamp(s0 - c0 * a, low[0] - reach, high[0] + reach)
-                d1 = _clamp(s1 - c1 * b, low[1] - reach, high[1] + reach)
-                d2 = _clamp(s2 - c2 * c, low[2] - reach, high[2] + reach)
+                _, (d0, d1, d2) = track_back(u, v, w, s0, s1, s2, courant, low, high, reach, flat)
                 d0, d1, d2 = d0 - h0, d1 - h1, d2 - h2
                 if cubic:
                     value = _cubic(q, d0, d1, d2, flat)

@@ -69,7 +69,7 @@ class Cut(NamedTuple):
 
 @njit(cache=True)
 def reach_pieces(cut, base, start, piece, pick, queue):
-    """Find which piece of each cell of a window a piece is joined with; return whether anything is hidden from it.
+    """Find which piece of each cell of a window a piece is joined with.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def reach_pieces(cut, base, start, piece, pick, queue):
         Room for as many cells.
     """
     # the counting of references to arrays that are handed on costs more than the search: flat arrays, and no calls
-    kinds, firsts, extra, fluid, dim = cut.kinds, cut.firsts, cut.extra, cut.fluid, cut.dim
+    kinds, firsts, fluid, dim = cut.kinds, cut.firsts, cut.fluid, cut.dim
     links = cut.ends, cut.below, cut.above, cut.part
     _, m1, m2 = fluid.shape
     n0, n1, n2 = pick.shape
@@ -125,11 +125,52 @@ def reach_pieces(cut, base, start, piece, pick, queue):
                     queue[tail, 0], queue[tail, 1] = beside, i + step * (a == 0)
                     queue[tail, 2], queue[tail, 3] = j + step * (a == 1), k + step * (a == 2)
                     tail += 1
-    for i in range(MARGIN, n0 - MARGIN):
-        for j in range(MARGIN, n1 - MARGIN):
-            for k in range(deep, n2 - deep):
-                c = (base[0] + i, base[1] + j, base[2] + k)
-                if extra[c] >= 0 or (pick[i, j, k] < 0 and fluid[c]):
+
+
+@njit(cache=True)
+def lead_around(cut, cells, pieces, reach):
+    """Return which further pieces water leads around to from the first ones of their cells within so many cells.
+
+    Parameters
+    ----------
+    cut : Cut
+    cells, pieces : ndarray of int64, shape (n, 3), (n,)
+    reach : int
+    """
+    dim = cut.dim
+    pick, queue = _search_room(reach, dim)
+    links = cut.ends, cut.below, cut.above, cut.part
+    mid = reach + MARGIN
+    deep = mid if dim == 3 else 0
+    found = np.zeros(len(cells), np.bool_)
+    for n in range(len(cells)):
+        c = (cells[n, 0], cells[n, 1], cells[n, 2])
+        reach_pieces(cut, (c[0] - mid, c[1] - mid, c[2] - deep), (mid, mid, deep), pieces[n], pick, queue)
+        for a in range(dim):
+            for side in range(2):
+                f = (c[0] + side * (a == 0), c[1] + side * (a == 1), c[2] + side * (a == 2))
+                to = -1
+                if cut.kind[a][f] == PRESSURE:
+                    to = 0
+                elif cut.kind[a][f] == SPLIT:
+                    to = _through(links, cut.first[a][f], 0, side)
+                step = 2 * side - 1
+                w = (mid + step * (a == 0), mid + step * (a == 1), deep + step * (a == 2))
+                if to >= 0 and pick[w] == to:
+                    found[n] = True
+    return found
+
+
+@njit(cache=True)
+def _hides(cut, base, pick, box):
+    """Return whether there is anything in a box that a search has not reached, or only in part."""
+    begin, end = box
+    for i in range(max(begin[0], base[0] + MARGIN), min(end[0], base[0] + pick.shape[0] - MARGIN)):
+        for j in range(max(begin[1], base[1] + MARGIN), min(end[1], base[1] + pick.shape[1] - MARGIN)):
+            for k in range(max(begin[2], base[2]), min(end[2], base[2] + pick.shape[2])):
+                if cut.extra[i, j, k] >= 0:
+                    return True
+                if cut.fluid[i, j, k] and pick[i - base[0], j - base[1], k - base[2]] == -1:
                     return True
     return False
 
@@ -431,8 +472,8 @@ def _limits(low, high, base, w, crossed):
 
 @njit(cache=True)
 def carry_faces(
-    cut, cells, pieces, reach, same, path, path_parts, faces, parts, known, from_below, moved, courant, low, high,
-    cubic, keep, out, out_parts, done,
+    cut, cells, pieces, boxes, reach, same, path, path_parts, faces, parts, known, from_below, moved, courant, low,
+    high, cubic, keep, out, out_parts, done,
 ):  # fmt: skip
     """Carry what is on faces to those of some pieces from which something is hidden, each along its own side.
 
@@ -442,6 +483,8 @@ def carry_faces(
     cells : ndarray of int64, shape (n, 3)
         Local cells.
     pieces : ndarray of int64, shape (n,)
+    boxes : ndarray of int64, shape (n, 2, 3)
+        Where something hidden would matter, see ``thin.face_boxes``.
     reach : int
         Cells that the flow crosses, and the stencil.
     same : bool
@@ -472,7 +515,8 @@ def carry_faces(
     for n in range(len(cells)):
         c, piece = (cells[n, 0], cells[n, 1], cells[n, 2]), pieces[n]
         base = (c[0] - mid, c[1] - mid, c[2] - deep)
-        if not reach_pieces(cut, base, start, piece, pick, queue):
+        reach_pieces(cut, base, start, piece, pick, queue)
+        if not _hides(cut, base, pick, boxes[n]):
             continue
         for a in range(dim):
             some[a] = complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
@@ -526,7 +570,7 @@ def _leads(cut, first, piece, up, from_below):
 
 @njit(cache=True)
 def carry_cells(
-    cut, cells, pieces, reach, path, path_parts, known, smoke, extras, courant, low, high, beyond, cubic, out,
+    cut, cells, pieces, boxes, reach, path, path_parts, known, smoke, extras, courant, low, high, beyond, cubic, out,
     out_extras, done,
 ):  # fmt: skip
     """Carry smoke to some pieces from which something is hidden; see ``carry_faces``.
@@ -550,7 +594,8 @@ def carry_cells(
     for n in range(len(cells)):
         c, piece = (cells[n, 0], cells[n, 1], cells[n, 2]), pieces[n]
         base = (c[0] - mid, c[1] - mid, c[2] - deep)
-        if not reach_pieces(cut, base, w, piece, pick, queue):
+        reach_pieces(cut, base, w, piece, pick, queue)
+        if not _hides(cut, base, pick, boxes[n]):
             continue
         for a in range(dim):
             complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
@@ -629,38 +674,3 @@ def guess_cells(cut, cells, pieces, reach, smoke, extras):
             if layer[w] != UNKNOWN:
                 out[n] = q[w]
     return out
-
-
-@njit(cache=True)
-def thin_walls(kind, fluid, low, high, dim, thickest):
-    """Return the cells with a wall beside them, along an axis, that has fluid behind it so few cells away.
-
-    Parameters
-    ----------
-    kind : tuple of three ndarray of uint8
-        Face arrays.
-    fluid : ndarray of bool
-        Cell array.
-    low, high : ndarray of int64, shape (3,)
-        The local cells that lie in the domain.
-    dim : int
-    thickest : int
-        Cells.
-    """
-    found = np.zeros(fluid.shape, np.bool_)
-    for i in range(low[0], high[0]):
-        for j in range(low[1], high[1]):
-            for k in range(low[2], high[2]):
-                if not fluid[i, j, k]:
-                    continue
-                for a in range(dim):
-                    c, end = (i, j, k), high[a]
-                    f = (i + (a == 0), j + (a == 1), k + (a == 2))
-                    if c[a] + 1 >= end or kind[a][f] == PRESSURE or kind[a][f] == SPLIT:
-                        continue
-                    for m in range(1, min(thickest + 1, end - 1 - c[a]) + 1):
-                        other = (i + m * (a == 0), j + m * (a == 1), k + m * (a == 2))
-                        if fluid[other]:
-                            found[c], found[other] = True, True
-                            break
-    return found

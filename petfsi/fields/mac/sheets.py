@@ -7,13 +7,11 @@ from functools import cached_property
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.fields.mac import charts, kinds
+from petfsi.fields.mac import charts, kinds, thin
 from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.parts import LocalParts, Parts, ranges
 
-#: Walls of so many cells or fewer are sheets, too: stencils of both sides would read the band in their middle.
-THICKEST = 2
 #: Cells that an extrapolation looks at on either side.
 AROUND = 3
 
@@ -47,13 +45,25 @@ class Sheets:
         inside = grid.inside(None)
         self._low, self._high = (np.array([getattr(s, end) for s in inside]) for end in ("start", "stop"))
         self._fluid, self._kind, self._narrow, self._given = cell_kind == kinds.FLUID, face_kind, narrow, given
-        thin = charts.thin_walls(three(face_kind), self._fluid, self._low, self._high, grid.dim, THICKEST)
-        self._near = thin | (self.local.extra >= 0) if len(table) else thin
+        near = thin.thin_walls(three(face_kind), self._fluid, self._low, self._high, grid.dim)
+        self._divided = self.local.extra >= 0
+        if len(table):
+            near[self._dividing()] = True
+        grid.exchange_cells(near)
+        self._near = near
         #: Whether there is any sheet near this rank.
-        self.any = bool(self._near.any())
+        self.any = bool(near.any() or self._divided.any())
         self.from_below = self._ends()
         self._known = np.ones(len(table), dtype=bool)
         self._targets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _dividing(self) -> tuple[np.ndarray, ...]:
+        """Return this rank's own divided cells, but those whose further pieces are slight and joined with the first."""
+        local, table = self.local, self.table
+        cells = np.column_stack(np.unravel_index(local.piece_cell, self.grid.shape(None))).reshape(-1, 3)
+        around = charts.lead_around(self.cut, cells.astype(np.int64), table.piece[local.pieces], thin.AROUND[0])
+        slight = around & (table.volume[local.pieces] < thin.SLIGHT)
+        return tuple(cells[~slight].T)
 
     @cached_property
     def cut(self) -> charts.Cut:
@@ -78,15 +88,32 @@ class Sheets:
         """Return this rank's pieces that lie so near a sheet: local cells (n, 3) and numbers."""
         if reach not in self._targets:
             near = self._near
+            part = self.grid.owned(None)
             for b in range(self.grid.dim):
                 near = _spread(near, b, reach)
-            part = self.grid.owned(None)
-            cells = np.argwhere(near[part] & self._fluid[part]) + [s.start for s in part]
+            cells = np.argwhere((near[part] | self._divided[part]) & self._fluid[part]) + [s.start for s in part]
             local = self.local
             others = np.column_stack(np.unravel_index(local.piece_cell, self.grid.shape(None))).reshape(-1, 3)
             pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[local.pieces]))
             self._targets[reach] = np.concatenate((cells, others)).astype(np.int64), pieces
         return self._targets[reach]
+
+    @cached_property
+    def _counts(self) -> tuple[np.ndarray, np.ndarray]:
+        """How many cells before each are odd, and near a sheet."""
+        odd = thin.odd_cells(self._kind, self._narrow, self._divided, self._fluid, self._low, self._high)
+        return thin.count_before(odd), thin.count_before(self._near)
+
+    def _in_need(
+        self, reach: int, faces: bool, path: Faces, limits: tuple, beyond: float, cubic: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return those of this rank's pieces whose paths meet sheets, their numbers, and where, see ``thin``."""
+        cells, pieces = self._pieces(reach)
+        divided, (odd, near) = self._divided[tuple(cells.T)], self._counts
+        need, boxes = thin.in_need(
+            odd, near, cells, divided, faces, self._high, three(path), *limits, beyond, cubic, self.grid.dim
+        )
+        return cells[need], pieces[need], boxes[need]
 
     # ---- transport --------------------------------------------------------------------------------------------
 
@@ -98,9 +125,9 @@ class Sheets:
         out.parts = faces.parts.copy()
         done = np.zeros(len(self.table), dtype=bool)
         if self.any:
-            cells, pieces = self._pieces(reach)
+            targets = self._in_need(reach, True, path, (courant, low, high), 0.0, cubic)
             charts.carry_faces(
-                self.cut, cells, pieces, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
+                self.cut, *targets, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
                 self._known, self.from_below, three(moved), courant, low, high, cubic, keep, three(out), out.parts,
                 done,
             )  # fmt: skip
@@ -115,10 +142,10 @@ class Sheets:
         further = extras.copy()
         done = np.zeros(len(extras), dtype=bool)
         if self.any:
-            cells, pieces = self._pieces(reach)
+            targets = self._in_need(reach, False, path, (courant, low, high), beyond, cubic)
             charts.carry_cells(
-                self.cut, cells, pieces, reach, three(path), path.parts, self._known, smoke, extras, courant, low,
-                high, beyond, cubic, out, further, done,
+                self.cut, *targets, reach, three(path), path.parts, self._known, smoke, extras, courant, low, high,
+                beyond, cubic, out, further, done,
             )  # fmt: skip
         return self.local.gathered(further, np.flatnonzero(done))
 
