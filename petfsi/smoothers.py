@@ -24,9 +24,10 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
+from numba import njit
 from petsc4py import PETSc
 
-from petfsi.petsc import factorised, row_sums
+from petfsi.petsc import factorised
 from petfsi.resisted import Resisted
 
 #: Largest E_ii / L_ii up to which the diagonal is good enough.
@@ -102,7 +103,18 @@ class Walls:
 def _bound(mat: PETSc.Mat) -> PETSc.Vec:
     """Return max(a_ii, sum_j |a_ij| / 2) by row. Collective."""
     diagonal = mat.getDiagonal()
-    indptr, columns, values = mat.getValuesCSR()
-    sums = row_sums(indptr, columns, np.abs(values))
+    indptr, _, values = mat.getValuesCSR()
+    sums = np.empty(len(indptr) - 1)
+    _absolute_sums(indptr, values, sums)
     diagonal.array = np.maximum(diagonal.array_r, 0.5 * sums)
     return diagonal
+
+
+@njit(cache=True)
+def _absolute_sums(indptr, values, out):
+    """Write the sum of the magnitudes of each row of a matrix in compressed rows."""
+    for row in range(len(out)):
+        total = 0.0
+        for n in range(indptr[row], indptr[row + 1]):
+            total += abs(values[n])
+        out[row] = total

@@ -15,7 +15,7 @@ from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
 from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, gather_triplets, row_sums, sum_csr
+from petfsi.petsc import IntType, gather_sums, gather_triplets, sum_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
@@ -172,8 +172,8 @@ class CutCellCoupling(Coupling):
         force = fluid.density / self._factor * slivers.size[thick] * known[slivers.slot[thick]]
         n = fluid.layout.n_local
         column = np.arange(n + 1), np.zeros(n, dtype=np.int64), np.ones(n)
-        entries = outer_products(*self._flux, *column, slivers.slot[thick], force)
-        self.solid.rhs += row_sums(*gather_triplets(self.comm, self.solid.layout, *entries))
+        i, _, values = outer_products(*self._flux, *column, slivers.slot[thick], force)
+        self.solid.rhs += gather_sums(self.comm, self.solid.layout, i, values)
         return known + fluid.spread(known)
 
     def enclose(self, members: list[np.ndarray]) -> Enclosure | None:

@@ -135,10 +135,42 @@ def velocity_at(u, v, w, s0, s1, s2, flat):
 
 
 @njit(cache=True, inline="always")
-def track_back(u, v, w, s0, s1, s2, courant, low, high, reach, flat):
-    """Return the middle and the begin of the path that ends at a point; see ``sweep``, whose arguments these are."""
+def _velocity_of(u, v, w, i, j, k, offset, flat):
+    """Return the velocity at an entry of a sweep: of its own faces, or the mean of those around."""
+    i, j, k = np.uint64(i), np.uint64(j), np.uint64(k)
+    one = np.uint64(1)
+    b = c = 0.0
+    if offset[0] == 0.0:
+        h = i - one
+        a = u[i, j, k]
+        b = 0.25 * ((v[h, j, k] + v[h, j + one, k]) + (v[i, j, k] + v[i, j + one, k]))
+        if not flat:
+            c = 0.25 * ((w[h, j, k] + w[h, j, k + one]) + (w[i, j, k] + w[i, j, k + one]))
+    elif offset[1] == 0.0:
+        h = j - one
+        a = 0.25 * ((u[i, h, k] + u[i + one, h, k]) + (u[i, j, k] + u[i + one, j, k]))
+        b = v[i, j, k]
+        if not flat:
+            c = 0.25 * ((w[i, h, k] + w[i, h, k + one]) + (w[i, j, k] + w[i, j, k + one]))
+    elif offset[2] == 0.0:
+        h = k - one
+        a = 0.25 * ((u[i, j, h] + u[i + one, j, h]) + (u[i, j, k] + u[i + one, j, k]))
+        b = 0.25 * ((v[i, j, h] + v[i, j + one, h]) + (v[i, j, k] + v[i, j + one, k]))
+        c = w[i, j, k]
+    else:
+        a = 0.5 * (u[i, j, k] + u[i + one, j, k])
+        b = 0.5 * (v[i, j, k] + v[i, j + one, k])
+        if not flat:
+            c = 0.5 * (w[i, j, k] + w[i, j, k + one])
+    return a, b, c
+
+
+@njit(cache=True, inline="always")
+def track_back(u, v, w, i, j, k, offset, courant, low, high, reach, flat):
+    """Return the middle and the begin of the path that ends at an entry; see ``sweep``, whose arguments these are."""
     c0, c1, c2 = courant
-    a, b, c = velocity_at(u, v, w, s0, s1, s2, flat)
+    s0, s1, s2 = i + offset[0], j + offset[1], k + offset[2]
+    a, b, c = _velocity_of(u, v, w, i, j, k, offset, flat)
     m0 = _clamp(s0 - 0.5 * c0 * a, low[0], high[0])
     m1 = _clamp(s1 - 0.5 * c1 * b, low[1], high[1])
     m2 = _clamp(s2 - 0.5 * c2 * c, low[2], high[2])
@@ -185,8 +217,7 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
                 if not moved[i, j, k]:
                     out[i, j, k] = q[i, j, k]
                     continue
-                s0, s1, s2 = i + h0, j + h1, k + h2
-                _, (d0, d1, d2) = track_back(u, v, w, s0, s1, s2, courant, low, high, reach, flat)
+                _, (d0, d1, d2) = track_back(u, v, w, i, j, k, offset, courant, low, high, reach, flat)
                 d0, d1, d2 = d0 - h0, d1 - h1, d2 - h2
                 if cubic:
                     value = _cubic(q, d0, d1, d2, flat)

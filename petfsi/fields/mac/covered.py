@@ -16,7 +16,7 @@ from petfsi.fields.mac.parts import Parts
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, periodic_axes
 from petfsi.fields.mac.slivers import outer_products
-from petfsi.petsc import gather_triplets, new_block, row_sums, set_csr, sum_csr
+from petfsi.petsc import gather_sums, gather_triplets, new_block, set_csr, sum_csr
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 
@@ -320,8 +320,8 @@ class CoveredGrid(FluidField):
         weight = self.density / self._assembled_for[1] * slivers.size[use] * outflow[slivers.slot[use]]
         n = len(outflow)
         column = np.arange(n + 1), np.zeros(n, dtype=np.int64), np.ones(n)
-        entries = outer_products(*self.flux_rows, *column, slivers.slot[use], weight)
-        return row_sums(*gather_triplets(self.comm, self.layout, *entries))
+        i, _, values = outer_products(*self.flux_rows, *column, slivers.slot[use], weight)
+        return gather_sums(self.comm, self.layout, i, values)
 
     def _part(self, axis: int | None) -> tuple[tuple[int, int], ...]:
         """Return the owned ranges of faces of ``axis`` (cells: None)."""

@@ -356,13 +356,17 @@ class MacFluid(CoveredGrid):
 
     def _outflow(self, velocity: Faces) -> np.ndarray:
         """Return the net outflow of each of this rank's unknowns through its faces, m^3/s (m^2/s in 2D)."""
-        inflow = np.zeros(self.layout.n_local)
+        inflow, cells = np.zeros(self.layout.n_local), np.zeros(self.grid.owned_shape)
         areas = np.array([self.grid.face_area(axis) for axis in self._axes])
+        own = self.grid.owned(None)
         for axis in self._axes:
-            pressure.known_inflow(
-                self._active, velocity[axis], self.boundary_velocity[axis], self.face_kind[axis], self.openness[axis],
-                kinds.STEP[axis], areas[axis], self._part(None), inflow,
-            )  # fmt: skip
+            through = np.empty_like(velocity[axis])
+            faces = velocity[axis], self.boundary_velocity[axis], self.face_kind[axis], self.openness[axis], through
+            pressure.known_flows(*(array.reshape(-1) for array in faces))
+            above = tuple(slice(s.start + 1, s.stop + 1) if b == axis else s for b, s in enumerate(own))
+            cells += areas[axis] * (through[own] - through[above])
+        cells[~self._active[own]] = 0.0
+        inflow[: self.n_cells] = cells.ravel(order="F")
         if self.extras is not None:
             self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
         return -inflow

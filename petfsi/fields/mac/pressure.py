@@ -136,7 +136,7 @@ def laplacian(active, kind0, kind1, kind2, open0, open1, open2, part, slot, c, v
                     kinds_below[2], kinds_above[2] = kind2[i, j, k], kind2[i, j, k + 1]
                 below[0] = c[0] * _seen(open0[i, j, k])
                 above[0] = c[0] * _seen(open0[i + 1, j, k])
-                below[1], above[1] = c[1] * open1[i, j, k], c[1] * open1[i, j + 1, k]
+                below[1], above[1] = c[1] * _seen(open1[i, j, k]), c[1] * _seen(open1[i, j + 1, k])
                 if not flat:
                     below[2], above[2] = c[2] * _seen(open2[i, j, k]), c[2] * _seen(open2[i, j, k + 1])
                 diagonal = 0.0
@@ -168,22 +168,17 @@ def _flux(star, bound, kind, i, j, k):
 
 
 @njit(cache=True)
-def known_inflow(active, star, bound, kind, openness, step, area, part, out):
-    """Add minus the net outflow through one axis' faces, without SOLID_FACEs, to ``out`` in the DMDA's order."""
-    (b0, e0), (b1, e1), (b2, e2) = part
-    di, dj, dk = step
-    for i in range(b0, e0):
-        for j in range(b1, e1):
-            for k in range(b2, e2):
-                if active[i, j, k]:
-                    row = (i - b0) + (e0 - b0) * ((j - b1) + (e1 - b1) * (k - b2))
-                    above = openness[i + di, j + dj, k + dk] * _flux(star, bound, kind, i + di, j + dj, k + dk)
-                    out[row] -= area * (above - openness[i, j, k] * _flux(star, bound, kind, i, j, k))
+def known_flows(star, bound, kind, openness, out):
+    """Write the known flow through each face that counts on the right-hand side, by its whole area; flat arrays."""
+    for n in range(len(out)):
+        here = kind[n]
+        value = star[n] if here == PRESSURE or here == OPEN else bound[n] if here == WALL else 0.0
+        out[n] = openness[n] * value
 
 
 @njit(cache=True)
 def known_inflow_of(rows, star, bound, kind, openness, step, area, part, out):
-    """Do as ``known_inflow`` for active cells given by their numbers in the DMDA's order; ``out`` is theirs alone."""
+    """Add minus the net outflow through one axis' faces to ``out``, of active cells by their numbers in the DMDA."""
     (b0, e0), (b1, e1), (b2, e2) = part
     di, dj, dk = step
     for n in range(len(rows)):

@@ -110,8 +110,9 @@ class Sheets:
         """Return those of this rank's pieces whose paths meet sheets, their numbers, and where, see ``thin``."""
         cells, pieces = self._pieces(reach)
         divided, (odd, near) = self._divided[tuple(cells.T)], self._counts
+        courant, low, high = limits
         need, boxes = thin.in_need(
-            odd, near, cells, divided, faces, self._high, three(path), *limits, beyond, cubic, self.grid.dim
+            odd, near, cells, divided, faces, self._high, three(path), courant, low, high, beyond, cubic, self.grid.dim
         )
         return cells[need], pieces[need], boxes[need]
 

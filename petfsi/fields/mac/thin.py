@@ -14,7 +14,7 @@ THICKEST = 2
 #: of either side is wide, stencils read little of the other.
 AROUND = (2, 3, 5)
 #: Further pieces smaller than this part of their cell count for nothing where water leads around to them.
-SLIGHT = 0.05
+SLIGHT = 0.1
 
 
 @njit(cache=True)
@@ -170,15 +170,17 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, low, hig
         begin[0], begin[1], begin[2] = c
         end[0], end[1], end[2] = c[0] + 1, c[1] + 1, c[2] + 1
         for a in range(dim if faces else 1):
-            for up in range(1 + (faces and c[a] == high_cell[a] - 1)):
-                s = (
-                    c[0] + (up if faces and a == 0 else 0.5), c[1] + (up if faces and a == 1 else 0.5),
-                    c[2] + (up if faces and a == 2 else 0.5),
+            for up in range(2 if faces and c[a] == high_cell[a] - 1 else 1):
+                f = (c[0] + up * (a == 0), c[1] + up * (a == 1), c[2] + up * (a == 2))
+                offset = (
+                    0.0 if faces and a == 0 else 0.5, 0.0 if faces and a == 1 else 0.5, 0.0 if faces and a == 2 else 0.5
                 )  # fmt: skip
-                m, d = track_back(path[0], path[1], path[2], s[0], s[1], s[2], courant, low, high, beyond, flat)
+                m, d = track_back(
+                    path[0], path[1], path[2], f[0], f[1], f[2], offset, courant, low, high, beyond, flat
+                )  # fmt: skip
                 for b in range(dim):
-                    first = min(int(s[b]) - 1, int(m[b]) - 1, int(np.floor(d[b])) - wide)
-                    last = max(int(s[b]) + 1, int(m[b]) + 1, int(np.floor(d[b])) + wide)
+                    first = min(f[b] - 1, int(m[b]) - 1, int(np.floor(d[b])) - wide)
+                    last = max(f[b] + 1, int(m[b]) + 1, int(np.floor(d[b])) + wide)
                     begin[b], end[b] = min(begin[b], first), max(end[b], last + 1)
         for b in range(dim):
             begin[b], end[b] = max(begin[b], 0), min(end[b], odd.shape[b] - 1)
