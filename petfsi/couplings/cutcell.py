@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from petfsi.fields.mac.fluid import MacFluid
 
 
+#: Cells that sheets may go from one cut to the next, see ``fields.mac.lineage``.
+STRIDE = 0.45
+
+
 class CutCellCoupling(Coupling):
     """Couples a MAC fluid and a solid's surface without loss: D1 H = J^T.
 
@@ -84,7 +88,8 @@ class CutCellCoupling(Coupling):
             # as all is at rest: what meets there is one
             self._seams = self.fluid.find_seams(positions, self.facets)
         part = None if self.curved is None else self.curved.part
-        walls, wet = self.fluid.cut(positions, self.facets, part, self._seams)
+        for place in self._stations(positions):
+            walls, wet = self.fluid.cut(place, self.facets, part, self._seams)
         self._walls, self._let_through = self.nodes[self._seams.walls], walls
         layout = self.fluid.layout
         points = self._walls[walls.facet] * self.dim + walls.axis[:, None]
@@ -99,6 +104,19 @@ class CutCellCoupling(Coupling):
             self._weight = self._rest_force(wet)
         self._stale = True
         self.n_coupled += 1
+
+    def _stations(self, positions: np.ndarray) -> list[np.ndarray]:
+        """Return where to cut the grid on the way to some positions, them last: sheets must not pass by cells unseen.
+
+        Collective.
+        """
+        sheets = self.fluid.sheets
+        if not self.comm.allreduce(sheets is not None and sheets.any, op=MPI.LOR):
+            return [positions]
+        begin = self.solid.surface_present()
+        way = positions - begin
+        n = max(1, int(np.ceil(np.abs(way / self.fluid.grid.dx).max(initial=0.0) / STRIDE)))
+        return [*(begin + k / n * way for k in range(1, n)), positions]
 
     def _sliver_mass(self, factor: float) -> Rows | None:
         """Return J T J^T over the slivers with S > 0, this rank's rows of the solid. Collective."""

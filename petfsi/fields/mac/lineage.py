@@ -4,7 +4,8 @@ Numbers of pieces say nothing over time: piece 0 is the largest, and a sheet tha
 the two. A piece goes on as that old one of its cell which shares most of its walls, by facets; if there is none, as
 that whose openings overlap most with its own or, in a cell that was whole or has become so, as the largest. A link
 goes on as that between the pieces that its own go on as, or of one of them, on the same face. What goes on as nothing
-begins with what its own side's surroundings say. So a sheet may go half a cell a step.
+begins with what its own side's surroundings say. So a sheet may go half a cell from one cut to the next; in a step
+in which it goes farther, the coupling cuts the grid on its way, too.
 """
 
 from __future__ import annotations
