@@ -73,6 +73,25 @@ def test_ranks_keep_the_sides_of_a_sheet_apart(name):
     see_rest_below(MPI.COMM_WORLD, name, "bdf2")
 
 
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("name", SHEETS)
+def test_probes_and_pictures_see_one_side_at_a_time(name):
+    height, thickness = SHEETS[name]
+    with simulation(MPI.COMM_WORLD, sheared(2, height, thickness), DIRECT) as sim:
+        for _ in range(12):
+            sim.advance()
+        for off in (1e-4, 0.01, 0.03):
+            below, above = ([0.47, height + side * (thickness / 2 + off)] for side in (-1, 1))
+            assert np.abs(sim.fluid.probe("velocity", below)).max() < 1e-12
+            assert sim.fluid.probe("velocity", above)[0] > 1.5
+            assert [sim.fluid.probe("smoke", at) for at in (below, above)] == pytest.approx([0.0, 1.0], abs=1e-14)
+        drawn = sim.fluid.output()
+        y = (drawn["kind"].start[1] + np.arange(drawn["kind"].data.shape[1]) + 0.5) / N
+        under = y < height - thickness / 2 - 1e-9
+        assert np.abs(drawn["velocity"].data[:, under]).max(initial=0.0) < 1e-12
+        assert np.abs(drawn["smoke"].data[:, under]).max(initial=0.0) == 0.0
+
+
 def test_a_sheet_in_space_keeps_its_sides_apart():
     height, thickness = 6.4 / 12, 0.002
     with simulation(MPI.COMM_SELF, sheared(3, height, thickness, 12), "monolithic.opts") as sim:

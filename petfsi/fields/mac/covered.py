@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
     "cell_kind", "face_kind", "openness", "narrow", "volume", "slivers", "extras", "index", "layout",
-    "block", "fluxes", "rhs", "cut_at",
+    "block", "fluxes", "rhs", "cut_at", "surface",
 )  # fmt: skip
 
 
@@ -59,6 +59,8 @@ class CoveredGrid(FluidField):
         None where nothing that cuts cells can move.
     cut_at : ndarray, shape (n, dim)
         Where the points of the surface were when it was last cut, m.
+    surface : (ndarray, ndarray)
+        Points and facets of all walls that the grid was last cut by.
     flux_rows : (ndarray, ndarray, ndarray)
         This rank's rows of L as last assembled, SI: indptr, global columns, values.
     volume : ndarray or None
@@ -96,6 +98,7 @@ class CoveredGrid(FluidField):
         self._regions: tuple[int, Regions] | None = None
         self.slivers: Slivers | None = None
         self.cut_at = np.zeros((0, self.dim))
+        self.surface = np.zeros((0, self.dim)), np.zeros((0, self.dim), dtype=np.int64)
         self._moves = self._cutter is not None and bool(scene.solids)
         self._new_blocks()
         self._pattern = pressure.Pattern(grid)
@@ -200,7 +203,8 @@ class CoveredGrid(FluidField):
             self._reach_changed()
         self.openness, self.volume, self.extras = found.openness, found.volume, found.extras
         self.slivers = found.slivers if self._moves else None
-        self.cut_at = found.points
+        self.cut_at, still = found.points, self._cutter.obstacles
+        self.surface = np.concatenate((points, still.points)), np.concatenate((facets, still.facets + len(points)))
         self._divide(found.parts, old_kind)
         self.geometry_version += 1
         return found.walls, found.wet

@@ -437,7 +437,8 @@ class MacFluid(CoveredGrid):
         return views.probe(self._view(), quantity, at)
 
     def _view(self) -> views.View:
-        return views.View(self.grid, self.cell_kind, self.velocity, self.pressure, self.smoke)
+        arrays = self.cell_kind, self.velocity, self.pressure, self.smoke, self.face_kind
+        return views.View(self.grid, *arrays, self.sheets, self.velocity.parts, self.surface)
 
     # ---- checkpoint -------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from numba import njit
 from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid
 from petfsi.fields.mac.kinds import DEAD
-from petfsi.fields.mac.parts import Parts, local_images
+from petfsi.fields.mac.parts import Parts, cells_beside, local_images
 from petfsi.fields.mac.sheets import Sheets
 
 #: Sources of a part that none of the old ones is: the undivided face or cell, and nothing.
@@ -159,20 +159,6 @@ def _openings(grid: MacGrid, table: Parts, cells: np.ndarray, count: np.ndarray)
         use = np.flatnonzero((piece >= 0) & (cells[at] == cell))
         np.add.at(out, (first[at[use]] + piece[use], 2 * table.axis[use] + side), table.openness[use])
     return out
-
-
-def cells_beside(grid: MacGrid, table: Parts, below: bool) -> np.ndarray:
-    """Return the natural indices of the cells below or above the links' faces; -1 beyond a side."""
-    cell = np.full(len(table), -1, dtype=np.int64)
-    for a in range(grid.dim):
-        mine = np.flatnonzero(table.axis == a)
-        place = list(np.unravel_index(table.face[mine], [n + (b == a) for b, n in enumerate(grid.cells)]))
-        place[a] = place[a] - below
-        if grid.periodic[a]:
-            place[a] = place[a] % grid.cells[a]
-        inside = (place[a] >= 0) & (place[a] < grid.cells[a])
-        cell[mine[inside]] = np.ravel_multi_index([i[inside] for i in place], grid.cells)
-    return cell
 
 
 @njit(cache=True)

@@ -161,6 +161,20 @@ def _whole(grid: MacGrid, axis: int | None) -> tuple[int, ...]:
     return tuple(n + (b == axis) for b, n in enumerate(grid.cells))
 
 
+def cells_beside(grid: MacGrid, table: Parts, below: bool) -> np.ndarray:
+    """Return the natural indices of the cells below or above the links' faces; -1 beyond a side."""
+    cell = np.full(len(table), -1, dtype=np.int64)
+    for a in range(grid.dim):
+        mine = np.flatnonzero(table.axis == a)
+        place = list(np.unravel_index(table.face[mine], [n + (b == a) for b, n in enumerate(grid.cells)]))
+        place[a] = place[a] - below
+        if grid.periodic[a]:
+            place[a] = place[a] % grid.cells[a]
+        inside = (place[a] >= 0) & (place[a] < grid.cells[a])
+        cell[mine[inside]] = np.ravel_multi_index([i[inside] for i in place], grid.cells)
+    return cell
+
+
 def local_images(grid: MacGrid, axis: int | None, natural: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the local entries, ghosts and periodic images included, of faces of an axis (cells: None).
 
@@ -284,6 +298,48 @@ class LocalParts:
             mine = axis == a
             values[self.link[mine]] = array.reshape(-1)[self.entry[mine]]
         return values
+
+    def in_first_pieces(self, arrays: list[np.ndarray], parts: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return this rank's own divided cells, flat, and the velocity of their first pieces, which are the largest.
+
+        Parameters
+        ----------
+        arrays : list of ndarray
+            Face arrays.
+        parts : ndarray
+            Values of links.
+
+        Returns
+        -------
+        cells : ndarray of int64, shape (n,)
+        velocity : list of ndarray, shape (n,)
+            By axis: the mean of what passes through both faces, or through the one that lets any through.
+        """
+        grid, table, cells = self.grid, self.table, np.unique(self.table.cell)
+        flat, which = local_images(grid, None, cells)
+        own = owned(grid, None, flat)
+        columns = []
+        for a, array in enumerate(arrays):
+            sides, weights = [], []
+            for upper, piece in ((0, table.above), (1, table.below)):
+                mine = np.flatnonzero((table.axis == a) & (piece == 0))
+                cell = cells_beside(grid, table, upper == 1)[mine]
+                at = np.minimum(np.searchsorted(cells, cell), max(len(cells) - 1, 0))
+                use = np.flatnonzero(cells[at] == cell) if len(cells) else mine[:0]
+                open_part = np.bincount(at[use], table.openness[mine[use]], len(cells))
+                flow = np.bincount(at[use], (table.openness * parts)[mine[use]], len(cells))
+                # faces on a side with a given velocity are no links
+                place = np.array(np.unravel_index(flat[own], grid.shape(None)))
+                place[a] += upper
+                on_side = (place[a] - grid.ghost[a] + grid.lo[a]) == (grid.cells[a] if upper else 0)
+                given = array[tuple(place)]
+                here, flow = open_part[which[own]], flow[which[own]]
+                linked = here > 0.0
+                sides.append(np.where(linked, flow / np.where(linked, here, 1.0), given))
+                weights.append(linked | (on_side & (not grid.periodic[a])))
+            count = np.maximum(weights[0].astype(int) + weights[1], 1)
+            columns.append((weights[0] * sides[0] + weights[1] * sides[1]) / count)
+        return flat[own], columns
 
     def mean_into(self, arrays: list[np.ndarray], parts: np.ndarray) -> None:
         """Write the mean over the parts of divided faces into face arrays, ghosts included."""

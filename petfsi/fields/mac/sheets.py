@@ -34,6 +34,8 @@ class Sheets:
     ----------
     table : Parts
     local : LocalParts
+    near : ndarray of bool
+        Cell array: cells that are divided or lie at thin walls, see ``thin``.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class Sheets:
         if len(table):
             near[self._dividing()] = True
         grid.exchange_cells(near)
-        self._near = near
+        self.near = near
         #: Whether there is any sheet near this rank.
         self.any = bool(near.any() or self._divided.any())
         self.from_below = self._ends()
@@ -87,7 +89,7 @@ class Sheets:
     def _pieces(self, reach: int) -> tuple[np.ndarray, np.ndarray]:
         """Return this rank's pieces that lie so near a sheet: local cells (n, 3) and numbers."""
         if reach not in self._targets:
-            near = self._near
+            near = self.near
             part = self.grid.owned(None)
             for b in range(self.grid.dim):
                 near = _spread(near, b, reach)
@@ -102,7 +104,7 @@ class Sheets:
     def _counts(self) -> tuple[np.ndarray, np.ndarray]:
         """How many cells before each are odd, and near a sheet."""
         odd = thin.odd_cells(self._kind, self._narrow, self._divided, self._fluid, self._low, self._high)
-        return thin.count_before(odd), thin.count_before(self._near)
+        return thin.count_before(odd), thin.count_before(self.near)
 
     def _in_need(
         self, reach: int, faces: bool, path: Faces, limits: tuple, beyond: float, cubic: bool
