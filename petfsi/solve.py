@@ -347,20 +347,32 @@ class Solver:
         """
         ksp = self._ksp
         assert ksp is not None
-        self._inner_iterations = 0
         floor = self.system.rhs_round_off()
         if ksp.getType() != PETSc.KSP.Type.PREONLY:
             if not PETSc.Options(self.prefix).hasName("ksp_atol"):
                 ksp.setTolerances(atol=floor)
             if self._pressure is not None:
                 self._pressure.aim(max(ksp.getTolerances()[0] * b.norm(), floor))
+        iterations = self._run(b, x)
+        norms = self.system.update_residual(x, b)
+        missed = norms[""] > max(ksp.getTolerances()[0] * norms["rhs"], floor)
+        if missed and ksp.getConvergedReason() > 0 and ksp.getInitialGuessNonzero() and not self.fixed_iterations:
+            # what iterations update drifts from the true residual by round-off: they go on from there
+            iterations += self._run(b, x)
+            self._inner_iterations = iterations
+            norms = self.system.update_residual(x, b)
+        self._judge(ksp, norms, slack, floor)
+        return iterations, norms
+
+    def _run(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
+        """Run the solver; return its iterations, of the inner one if that takes more. Collective."""
+        assert self._ksp is not None
+        self._inner_iterations = 0
         try:
-            ksp.solve(b, x)
+            self._ksp.solve(b, x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{self.prefix}' broke down: {petsc_text(error)}") from None
-        norms = self.system.update_residual(x, b)
-        self._judge(ksp, norms, slack, floor)
-        return max(self._inner_iterations, ksp.getIterationNumber()), norms
+        return max(self._inner_iterations, self._ksp.getIterationNumber())
 
     def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float, floor: float) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
