@@ -158,6 +158,8 @@ class Simulation:
     def forget(self) -> None:
         """Forget what a resumed run could not know: it must go on in the same way. Collective."""
         self.solver.reset()
+        for field in self.fields:
+            field.forget()
 
     def prepare(self) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.

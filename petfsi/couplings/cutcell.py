@@ -111,7 +111,7 @@ class CutCellCoupling(Coupling):
         Collective.
         """
         sheets = self.fluid.sheets
-        if not self.comm.allreduce(sheets is not None and sheets.any, op=MPI.LOR):
+        if sheets is None or not sheets.anywhere:
             return [positions]
         begin = self.solid.surface_present()
         way = positions - begin

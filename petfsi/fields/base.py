@@ -161,6 +161,9 @@ class Field(ABC):
         """Return the values (SI) at which ``block`` is the derivative: where Newton's method begins."""
         return self.unknown()
 
+    def forget(self) -> None:  # noqa: B027 - most fields know nothing else
+        """Forget what a resumed run could not know. Collective."""
+
     def round_off(self, x: np.ndarray) -> float:
         """Return what ``block @ x - rhs`` cannot fall below, eps ||block|| ||x||, in the solver's units. Collective.
 

@@ -27,7 +27,7 @@ from petfsi.output import files, hdf5
 from petfsi.ranks import on_root
 
 #: Of the layout of a checkpoint; raised when an older petfsi could not read it.
-FORMAT = 2
+FORMAT = 3
 _CHUNK = 1 << 24
 
 

@@ -162,20 +162,6 @@ def lead_around(cut, cells, pieces, reach):
 
 
 @njit(cache=True)
-def _hides(cut, base, pick, box):
-    """Return whether there is anything in a box that a search has not reached, or only in part."""
-    begin, end = box
-    for i in range(max(begin[0], base[0] + MARGIN), min(end[0], base[0] + pick.shape[0] - MARGIN)):
-        for j in range(max(begin[1], base[1] + MARGIN), min(end[1], base[1] + pick.shape[1] - MARGIN)):
-            for k in range(max(begin[2], base[2]), min(end[2], base[2] + pick.shape[2])):
-                if cut.extra[i, j, k] >= 0:
-                    return True
-                if cut.fluid[i, j, k] and pick[i - base[0], j - base[1], k - base[2]] == -1:
-                    return True
-    return False
-
-
-@njit(cache=True)
 def _through(links, first, piece, up):
     """Return the piece on the other side of a divided face that the widest link from a piece leads to; -1 for none."""
     ends, lower, upper, part = links
@@ -472,10 +458,10 @@ def _limits(low, high, base, w, crossed):
 
 @njit(cache=True)
 def carry_faces(
-    cut, cells, pieces, boxes, reach, same, path, path_parts, faces, parts, known, from_below, moved, courant, low,
-    high, cubic, keep, out, out_parts, done,
+    cut, cells, pieces, reach, same, path, path_parts, faces, parts, known, from_below, moved, courant, low,
+    high, cubic, keep, own_faces, out, out_parts, done, kept,
 ):  # fmt: skip
-    """Carry what is on faces to those of some pieces from which something is hidden, each along its own side.
+    """Carry what is on faces to those of some pieces near sheets, each along its own side.
 
     Parameters
     ----------
@@ -483,8 +469,6 @@ def carry_faces(
     cells : ndarray of int64, shape (n, 3)
         Local cells.
     pieces : ndarray of int64, shape (n,)
-    boxes : ndarray of int64, shape (n, 2, 3)
-        Where something hidden would matter, see ``thin.face_boxes``.
     reach : int
         Cells that the flow crosses, and the stencil.
     same : bool
@@ -497,10 +481,14 @@ def carry_faces(
         As for ``advect.sweep``; a mask per axis.
     keep : bool
         Whether what targets have beyond the values that are read stays with them, see ``advect.keep_own``.
+    own_faces : tuple of three ndarray
+        What faces have themselves.
     out, out_parts
         What is carried to plain faces and to links.
     done : ndarray of bool, shape (n_links,)
         Set where that was written.
+    kept : tuple of three ndarray of bool
+        Set where faces were told to keep their own.
     """
     dim = cut.dim
     pick, queue = _search_room(reach, dim)
@@ -516,8 +504,6 @@ def carry_faces(
         c, piece = (cells[n, 0], cells[n, 1], cells[n, 2]), pieces[n]
         base = (c[0] - mid, c[1] - mid, c[2] - deep)
         reach_pieces(cut, base, start, piece, pick, queue)
-        if not _hides(cut, base, pick, boxes[n]):
-            continue
         for a in range(dim):
             some[a] = complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
         for a in range(dim):
@@ -551,12 +537,12 @@ def carry_faces(
                         if from_below[link] != (up == 1) or piece != (cut.below[link] if up else cut.above[link]):
                             continue
                     if keep:
-                        own[a][w], new[a][w] = parts[link] if divided else faces[a][f], value
+                        own[a][w], new[a][w] = parts[link] if divided else own_faces[a][f], value
                         keep_own(new[a], own[a], q, flow[0], flow[1], flow[2], offset, part, courant)
                     if divided:
                         out_parts[link], done[link] = new[a][w], True
                     else:
-                        out[a][f] = new[a][w]
+                        out[a][f], kept[a][f] = new[a][w], keep
 
 
 @njit(cache=True)
@@ -570,10 +556,10 @@ def _leads(cut, first, piece, up, from_below):
 
 @njit(cache=True)
 def carry_cells(
-    cut, cells, pieces, boxes, reach, path, path_parts, known, smoke, extras, courant, low, high, beyond, cubic, out,
+    cut, cells, pieces, reach, path, path_parts, known, smoke, extras, courant, low, high, beyond, cubic, out,
     out_extras, done,
 ):  # fmt: skip
-    """Carry smoke to some pieces from which something is hidden; see ``carry_faces``.
+    """Carry smoke to some pieces near sheets; see ``carry_faces``.
 
     Parameters
     ----------
@@ -595,8 +581,6 @@ def carry_cells(
         c, piece = (cells[n, 0], cells[n, 1], cells[n, 2]), pieces[n]
         base = (c[0] - mid, c[1] - mid, c[2] - deep)
         reach_pieces(cut, base, w, piece, pick, queue)
-        if not _hides(cut, base, pick, boxes[n]):
-            continue
         for a in range(dim):
             complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
         _, left = fill_cells(cut, base, pick, smoke, extras, q, layer[3], todo)

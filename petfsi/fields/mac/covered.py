@@ -27,10 +27,12 @@ if TYPE_CHECKING:
     from petfsi.geometry.seams import Seams
 
 
+#: Walls in a cell that face somewhere with less than this part of a face's area face nowhere.
+FAINT = 1e-3
 #: What a step replaces before it is solved; none of it is changed in place.
 REPLACED = (
     "cell_kind", "face_kind", "openness", "narrow", "volume", "slivers", "extras", "index", "layout",
-    "block", "fluxes", "rhs", "cut_at", "surface",
+    "block", "fluxes", "rhs", "cut_at", "surface", "facing",
 )  # fmt: skip
 
 
@@ -59,6 +61,8 @@ class CoveredGrid(FluidField):
         None where nothing that cuts cells can move.
     cut_at : ndarray, shape (n, dim)
         Where the points of the surface were when it was last cut, m.
+    facing : list of ndarray
+        Cell arrays by axis: area times normal of the walls in each cell; empty where nothing cuts cells.
     surface : (ndarray, ndarray)
         Points and facets of all walls that the grid was last cut by.
     flux_rows : (ndarray, ndarray, ndarray)
@@ -98,6 +102,7 @@ class CoveredGrid(FluidField):
         self._regions: tuple[int, Regions] | None = None
         self.slivers: Slivers | None = None
         self.cut_at = np.zeros((0, self.dim))
+        self.facing = [grid.zeros_cells() for _ in self._axes] if self._cutter is not None else []
         self.surface = np.zeros((0, self.dim)), np.zeros((0, self.dim), dtype=np.int64)
         self._moves = self._cutter is not None and bool(scene.solids)
         self._new_blocks()
@@ -184,7 +189,7 @@ class CoveredGrid(FluidField):
             Where the surface reaches around periodic axes. In the answer facets are numbered among its walls.
         """
         assert self._cutter is not None
-        old_kind = self.face_kind
+        old_kind, old_cells, old_facing = self.face_kind, self.cell_kind, self.facing
         found = self._cutter.cut(points, facets, part, seams)
         changed = any(
             not np.array_equal(new, old)
@@ -205,9 +210,18 @@ class CoveredGrid(FluidField):
         self.slivers = found.slivers if self._moves else None
         self.cut_at, still = found.points, self._cutter.obstacles
         self.surface = np.concatenate((points, still.points)), np.concatenate((facets, still.facets + len(points)))
-        self._divide(found.parts, old_kind)
+        self.facing = found.facing
+        self._divide(found.parts, old_kind, (old_cells != kinds.FLUID) | self._turned(old_facing))
         self.geometry_version += 1
         return found.walls, found.wet
+
+    def _turned(self, before: list[np.ndarray]) -> np.ndarray:
+        """Return the cells whose walls face the other way now: they belong to the water on the other side."""
+        pairs = list(zip(before, self.facing, strict=True))
+        along = sum(one * other for one, other in pairs)
+        sizes = sum(one**2 for one, _ in pairs) * sum(other**2 for _, other in pairs)
+        # to within 60 degrees; what is left where two sides cancel is round-off
+        return (along < 0.0) & (along**2 > 0.25 * sizes) & (sizes > (FAINT * self.grid.face_area(0)) ** 4)
 
     def _remember(self, *more: str) -> None:
         """Keep what ``rewind`` puts back: attributes that are replaced, never changed in place."""
@@ -276,8 +290,17 @@ class CoveredGrid(FluidField):
     def _reach_changed(self) -> None:
         """Refresh what follows from where the flow can be read. Collective."""
 
-    def _divide(self, parts: Parts, old_kind: list[np.ndarray]) -> None:
-        """Take over what divided cells and faces consist of; faces had other kinds before. Collective."""
+    def _divide(self, parts: Parts, old_kind: list[np.ndarray], other: np.ndarray) -> None:
+        """Take over what divided cells and faces consist of. Collective.
+
+        Parameters
+        ----------
+        parts : Parts
+        old_kind : list of ndarray of uint8
+            Kinds of the faces before.
+        other : ndarray of bool
+            Cell array: which were no fluid before, or that on the other side of a wall.
+        """
 
     def _assemble_block(self, factor: float) -> None:
         """Fill L, and L + L T L, for the step's factor (see ``transport``). Collective."""

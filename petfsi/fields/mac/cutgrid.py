@@ -51,6 +51,8 @@ class Openings:
         Of this rank's unknowns that are solved, by their local numbers.
     points : ndarray, shape (n, dim)
         Where the surface was cut, see ``clipping.CutCells``.
+    facing : list of ndarray
+        Cell arrays by axis: area times normal of the walls in each cell, m^2 (m in 2D).
     """
 
     cell_kind: np.ndarray
@@ -66,6 +68,7 @@ class Openings:
     wet: Wet
     slivers: Slivers
     points: np.ndarray
+    facing: list[np.ndarray]
 
 
 class CutGrid:
@@ -172,7 +175,20 @@ class CutGrid:
             wet,
             slivers,
             found.points[:n_points],
+            self._facing(found),
         )
+
+    def _facing(self, found: CutCells) -> list[np.ndarray]:
+        """Return where the walls of each cell face. Collective."""
+        mine = np.flatnonzero(self._own[found.cell])
+        area, at = found.integrals[mine].sum(axis=1), self._flat[found.cell[mine]]
+        arrays = []
+        for a in range(self.grid.dim):
+            array = self.grid.zeros_cells()
+            np.add.at(array.reshape(-1), at, area * found.normals[found.facet[mine], a])
+            self.grid.exchange_cells(array)
+            arrays.append(array)
+        return arrays
 
     def _whole_openings(self, found: CutCells) -> list[np.ndarray]:
         """Return the open fractions of local faces by axis, split or not. Collective."""

@@ -15,7 +15,7 @@ from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.faces import Faces, each
 from petfsi.fields.mac.lineage import Lineage
 from petfsi.fields.mac.parts import Parts, read_whole, whole_slab
-from petfsi.fields.mac.sheets import Sheets
+from petfsi.fields.mac.sheets import Sheets, beside
 from petfsi.fields.mac.sides import evaluate_at, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
@@ -116,8 +116,12 @@ class MacFluid(CoveredGrid):
     def _renumber(self, found: Openings) -> None:
         """Take over the unknowns of split cells with the pressures that their cells had. Collective."""
         super()._renumber(found)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what a resumed run could not know: which pressures further pieces have, but by their cells."""
         known = self.pressure if self._other_pressure is None else self._other_pressure
-        self._extra_pressure = np.zeros(0) if found.extras is None else known.reshape(-1)[found.extras.cell]
+        self._extra_pressure = np.zeros(0) if self.extras is None else known.reshape(-1)[self.extras.cell]
 
     def _kinds_changed(self) -> None:
         """Refresh the smoke's band and prescribed velocities, too. Collective."""
@@ -136,13 +140,35 @@ class MacFluid(CoveredGrid):
             for band, kind in zip(self._bands, self.face_kind, strict=True)
         ]
 
-    def _divide(self, parts: Parts, old_kind: list[np.ndarray]) -> None:
+    def _divide(self, parts: Parts, old_kind: list[np.ndarray], other: np.ndarray) -> None:
         """Let divided faces and cells go on with what those had that they come from. Collective."""
         old, grid = self.sheets, self.grid
         self.sheets = self._sheets_of(parts)
         self._transport.advection.sheets = self.sheets
         if old is not None and (len(parts) or len(old.table)):
             self._go_on(Lineage(grid, old, self.sheets, old_kind))
+        if old is not None and self.sheets.anywhere:
+            self._renew(self.sheets, old_kind, other & ~old.divided)
+
+    def _renew(self, sheets: Sheets, old_kind: list[np.ndarray], other: np.ndarray) -> None:
+        """Give what thin walls have just uncovered the values of its own side. Collective."""
+        flipped = other & (self.cell_kind == kinds.FLUID) & ~sheets.divided
+        fresh = [
+            ((old == kinds.DEAD) | beside(flipped, a)) & ((new == kinds.PRESSURE) | (new == kinds.OPEN))
+            for a, (old, new) in enumerate(zip(old_kind, self.face_kind, strict=True))
+        ]
+        found = np.array([any(map(np.any, fresh)), flipped.any()], dtype=int)
+        faces_are, cells_are = self.comm.allreduce(found) > 0
+
+        def renewed(faces: Faces) -> Faces:
+            return sheets.renew_faces(faces, fresh)
+
+        if faces_are:
+            self.velocity, self.velocity_star = renewed(self.velocity), renewed(self.velocity_star)
+            self._transport.change(renewed)
+        if cells_are and self.smoke is not None:
+            self.smoke = sheets.renew_smoke(self.smoke, self.smoke_parts, flipped)
+            self._complete_cells(self.smoke)
 
     def _sheets_of(self, parts: Parts) -> Sheets:
         assert self.narrow is not None
@@ -323,7 +349,11 @@ class MacFluid(CoveredGrid):
                 self.grid.fill_sides(v, axis)
             self.grid.fill_sides(known, axis)
             extended.append(known)
-        return Faces(extended, faces.parts)
+        new = Faces(extended, faces.parts)
+        if self.sheets is None or not self.sheets.anywhere:
+            return new
+        # a band takes both sides; and what is narrow now may be read as it is in the next step
+        return self.sheets.renew_faces(new, self.sheets.slim)
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
         assert self._smoke_band is not None
@@ -487,6 +517,7 @@ class MacFluid(CoveredGrid):
         self._kinds_changed()
         if self.sheets is not None:
             self._restore_parts(read)
+            self.forget()
         if self.smoke is not None:
             self._complete_cells(self.smoke)
 
@@ -498,6 +529,7 @@ class MacFluid(CoveredGrid):
         for axis, letter in zip(self._axes, "xyz", strict=False):
             stored.append((f"velocity_carried_{letter}", self._transport.carried[axis], axis))
             stored.append((f"face_narrow_{letter}", self.narrow[axis], axis))
+            stored.append((f"wall_facing_{letter}", self.facing[axis], None))
         return stored
 
     def _stored_past(self) -> list[tuple[str, np.ndarray, int | None]]:

@@ -34,6 +34,8 @@ class Sheets:
     ----------
     table : Parts
     local : LocalParts
+    divided : ndarray of bool
+        Cell array: cells that hold several pieces.
     near : ndarray of bool
         Cell array: cells that are divided or lie at thin walls, see ``thin``.
     """
@@ -48,13 +50,14 @@ class Sheets:
         self._low, self._high = (np.array([getattr(s, end) for s in inside]) for end in ("start", "stop"))
         self._fluid, self._kind, self._narrow, self._given = cell_kind == kinds.FLUID, face_kind, narrow, given
         near = thin.thin_walls(three(face_kind), self._fluid, self._low, self._high, grid.dim)
-        self._divided = self.local.extra >= 0
+        self.divided = self.local.extra >= 0
         if len(table):
             near[self._dividing()] = True
         grid.exchange_cells(near)
         self.near = near
-        #: Whether there is any sheet near this rank.
-        self.any = bool(near.any() or self._divided.any())
+        #: Whether there is any sheet near this rank, and near any rank.
+        self.any = bool(near.any() or self.divided.any())
+        self.anywhere = bool(grid.comm.allreduce(self.any, op=MPI.LOR))
         self.from_below = self._ends()
         self._known = np.ones(len(table), dtype=bool)
         self._targets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -93,7 +96,7 @@ class Sheets:
             part = self.grid.owned(None)
             for b in range(self.grid.dim):
                 near = _spread(near, b, reach)
-            cells = np.argwhere((near[part] | self._divided[part]) & self._fluid[part]) + [s.start for s in part]
+            cells = np.argwhere((near[part] | self.divided[part]) & self._fluid[part]) + [s.start for s in part]
             local = self.local
             others = np.column_stack(np.unravel_index(local.piece_cell, self.grid.shape(None))).reshape(-1, 3)
             pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[local.pieces]))
@@ -103,39 +106,44 @@ class Sheets:
     @cached_property
     def _counts(self) -> tuple[np.ndarray, np.ndarray]:
         """How many cells before each are odd, and near a sheet."""
-        odd = thin.odd_cells(self._kind, self._narrow, self._divided, self._fluid, self._low, self._high)
+        odd = thin.odd_cells(self._kind, self._narrow, self.divided, self._fluid, self._low, self._high)
         return thin.count_before(odd), thin.count_before(self.near)
 
     def _in_need(
         self, reach: int, faces: bool, path: Faces, limits: tuple, beyond: float, cubic: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return those of this rank's pieces whose paths meet sheets, their numbers, and where, see ``thin``."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return those of this rank's pieces whose paths meet sheets, and their numbers, see ``thin``."""
         cells, pieces = self._pieces(reach)
-        divided, (odd, near) = self._divided[tuple(cells.T)], self._counts
+        divided, (odd, near) = self.divided[tuple(cells.T)], self._counts
         courant, low, high = limits
-        need, boxes = thin.in_need(
+        need = thin.in_need(
             odd, near, cells, divided, faces, self._high, three(path), courant, low, high, beyond, cubic, self.grid.dim
         )
-        return cells[need], pieces[need], boxes[need]
+        return cells[need], pieces[need]
 
     # ---- transport --------------------------------------------------------------------------------------------
 
     def carry_faces(
         self, faces: Faces, path: Faces, moved: list[np.ndarray], courant: tuple, reach: int, low: tuple, high: tuple,
-        cubic: bool, keep: bool, out: Faces,
-    ) -> None:  # fmt: skip
-        """Carry what is on faces along a path, near sheets; see ``charts.carry_faces``. Collective."""
+        cubic: bool, own: Faces | None, out: Faces,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """Carry what is on faces along a path, near sheets; see ``charts.carry_faces``. Collective.
+
+        Returns which faces have kept what they have of their ``own``.
+        """
+        kept = [np.zeros(v.shape, dtype=bool) for v in out]
         out.parts = faces.parts.copy()
         done = np.zeros(len(self.table), dtype=bool)
         if self.any:
             targets = self._in_need(reach, True, path, (courant, low, high), 0.0, cubic)
             charts.carry_faces(
                 self.cut, *targets, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
-                self._known, self.from_below, three(moved), courant, low, high, cubic, keep, three(out), out.parts,
-                done,
+                self._known, self.from_below, three(moved), courant, low, high, cubic, own is not None,
+                three(faces if own is None else own), three(out), out.parts, done, three(kept),
             )  # fmt: skip
         out.parts = self.local.gathered(out.parts, np.flatnonzero(done))
         self.local.mean_into(out, out.parts)
+        return kept
 
     def carry_smoke(
         self, smoke: np.ndarray, extras: np.ndarray, path: Faces, courant: tuple, reach: int, low: tuple, high: tuple,
@@ -207,6 +215,81 @@ class Sheets:
         grid.exchange_cells(smoke)
         extras[rows] = guess[len(cells) :]
         return smoke, local.gathered(extras, rows)
+
+    @cached_property
+    def slim(self) -> list[np.ndarray]:
+        """Face arrays: which are narrow and lie beside cells near sheets."""
+        found = []
+        for a, (narrow, kind) in enumerate(zip(self._narrow, self._kind, strict=True)):
+            faces = beside(self.near, a)
+            found.append(faces & narrow & ((kind == kinds.PRESSURE) | (kind == kinds.OPEN)))
+        return found
+
+    def renew_faces(self, faces: Faces, fresh: list[np.ndarray]) -> Faces:
+        """Return faces with those that walls have just uncovered extrapolated from their own side's water. Collective.
+
+        Parameters
+        ----------
+        faces : Faces
+        fresh : list of ndarray of bool
+            Face arrays. Those far from sheets stay as they are.
+        """
+        grid, close = self.grid, self._close
+        fresh = [marked & beside(close, a) for a, marked in enumerate(fresh)]
+        cut = self._without(fresh)
+        new = Faces([array.copy() for array in faces], faces.parts)
+        for a, array in enumerate(new):
+            grid.exchange_faces(a, array)
+            grid.fill_sides(array, a)
+        for a, array in enumerate(new):
+            part = grid.owned(a)
+            place = np.argwhere(fresh[a][part]) + [s.start for s in part]
+            cell = place.astype(np.int64)
+            up = (~self._fluid[tuple(cell.T)]).astype(np.int64)
+            cell[:, a] -= up
+            at = tuple(place.T)
+            values = array[at]
+            n = len(place)
+            charts.guess_links(
+                cut, np.arange(n), np.full(n, a), cell, np.zeros(n, np.int64), up, AROUND, three(new),
+                new.parts, self._known, values,
+            )  # fmt: skip
+            array[at] = values
+            grid.exchange_faces(a, array)
+            grid.fill_sides(array, a)
+        return new
+
+    def renew_smoke(self, smoke: np.ndarray, extras: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+        """Return smoke with the cells that walls have just uncovered given the mean of their own side. Collective."""
+        part, fresh = self.grid.owned(None), fresh & self._close
+        cells = (np.argwhere(fresh[part]) + [s.start for s in part]).astype(np.int64)
+        known = np.where(fresh, np.nan, smoke)
+        guess = charts.guess_cells(self.cut, cells, np.zeros(len(cells), np.int64), AROUND, known, extras)
+        new, use = smoke.copy(), ~np.isnan(guess)
+        new[tuple(cells[use].T)] = guess[use]
+        self.grid.exchange_cells(new)
+        return new
+
+    @cached_property
+    def _close(self) -> np.ndarray:
+        """Cell array: cells near sheets and those next to them."""
+        close = self.near
+        for b in range(self.grid.dim):
+            close = _spread(close, b, 1)
+        return close
+
+    def _without(self, fresh: list[np.ndarray]) -> charts.Cut:
+        """Return what kernels read, without some faces."""
+        return self.cut._replace(narrow=three([n | f for n, f in zip(self._narrow, fresh, strict=True)]))
+
+
+def beside(cells: np.ndarray, axis: int) -> np.ndarray:
+    """Return which faces of an axis have a marked cell next to them."""
+    faces = np.zeros([n + (b == axis) for b, n in enumerate(cells.shape)], dtype=bool)
+    view, marked = np.moveaxis(faces, axis, 0), np.moveaxis(cells, axis, 0)
+    view[:-1] |= marked
+    view[1:] |= marked
+    return faces
 
 
 def _spread(marked: np.ndarray, axis: int, reach: int) -> np.ndarray:

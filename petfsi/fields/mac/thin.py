@@ -8,11 +8,11 @@ from numba import njit
 from petfsi.fields.mac.advect import track_back
 from petfsi.fields.mac.kinds import OPEN, PRESSURE, SPLIT, WALL
 
-#: Walls of so many cells or fewer are sheets, too: stencils of both sides would read the band in their middle.
-THICKEST = 2
+#: Walls of so many cells or fewer are sheets, too: stencils and bands of both sides would meet in their middle.
+THICKEST = 4
 #: Walls of 0, 1, ... cells that water leads around within so many cells are edges: where walls are as thick as the band
 #: of either side is wide, stencils read little of the other.
-AROUND = (2, 3, 5)
+AROUND = (2, 3, 5, 5, 5)
 #: Further pieces smaller than this part of their cell count for nothing where water leads around to them.
 SLIGHT = 0.1
 
@@ -134,7 +134,7 @@ def _any(before, begin, end):
 
 @njit(cache=True)
 def in_need(odd, near, cells, divided, faces, high_cell, path, courant, low, high, beyond, cubic, dim):
-    """Find which cells' paths, as the grid has them, read what may be of the other side of a sheet, and where.
+    """Return which cells' paths, as the grid has them, read what may be of the other side of a sheet.
 
     A path that reads whole cells of open water alone, all joined with each other, or no wall that is thin, needs no
     more than the grid.
@@ -158,11 +158,9 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, low, hig
 
     Returns
     -------
-    need : ndarray of bool, shape (n,)
-    boxes : ndarray of int64, shape (n, 2, 3)
-        The first and one beyond the last of the cells that matter.
+    ndarray of bool, shape (n,)
     """
-    need, boxes = np.zeros(len(cells), np.bool_), np.zeros((len(cells), 2, 3), np.int64)
+    need = np.zeros(len(cells), np.bool_)
     flat, wide = dim == 2, 2 if cubic else 1
     begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
     for n in range(len(cells)):
@@ -189,5 +187,4 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, low, hig
         for b in range(dim):
             begin[b], end[b] = max(begin[b] - THICKEST, 0), min(end[b] + THICKEST, odd.shape[b] - 1)
         need[n] = divided[n] or _any(near, begin, end)
-        boxes[n, 0], boxes[n, 1] = begin, end
-    return need, boxes
+    return need

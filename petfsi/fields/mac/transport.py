@@ -100,7 +100,9 @@ class Advection:
         sweeps = max(1, int(np.ceil(courant / self.reach)))
         return Path(velocity, span, sweeps, max(1, int(np.ceil(courant / sweeps))))
 
-    def carry_faces(self, q: Faces, path: Path, moved: list[np.ndarray], out: Faces, keep: bool = False) -> None:
+    def carry_faces(
+        self, q: Faces, path: Path, moved: list[np.ndarray], out: Faces, own: Faces | None = None
+    ) -> list[np.ndarray] | None:
         """Carry what is on faces into the owned part of ``out``. Collective.
 
         Parameters
@@ -111,21 +113,29 @@ class Advection:
         moved : list of ndarray of bool
             Where; elsewhere ``out`` is q.
         out : Faces
-        keep : bool
-            Whether faces near sheets are to be told to ``keep_own``, too.
+        own : Faces, optional
+            What faces have themselves, which those near sheets are to keep as ``keep_own`` says.
+
+        Returns
+        -------
+        list of ndarray of bool or None
+            Which faces did; None where there are no sheets.
         """
-        keep = keep and path.sweeps == 1  # else it has all flowed on
+        kept = None
+        if path.sweeps > 1:
+            own = None  # it has all flowed on
         for left in reversed(range(path.sweeps)):
             target = Faces(np.empty_like(v) for v in q) if left else out
             for axis, v in enumerate(q):
                 self._sweep(v, path, moved[axis], axis, 0.0, target[axis])
             if self.sheets is not None:
-                self.sheets.carry_faces(q, path.velocity, moved, *self._limits(path), self.cubic, keep, target)
+                kept = self.sheets.carry_faces(q, path.velocity, moved, *self._limits(path), self.cubic, own, target)
             if left:
                 for axis, v in enumerate(target):
                     self.grid.exchange_faces(axis, v)
                     self.grid.fill_sides(v, axis)
                 q = target
+        return kept
 
     def carry_smoke(
         self, smoke: np.ndarray, extras: np.ndarray, path: Path, moved: np.ndarray
@@ -369,9 +379,10 @@ class MidpointTransport(Transport):
         own = self.past["velocity_kicked"] if self.past_dt else self.carried
         if self._read is None:  # a run that is resumed
             self._read = extend(each(np.copy, own)) if self.past_dt else own
-        self.advection.carry_faces(self._read, path, moved, star, keep=True)
+        kept = self.advection.carry_faces(self._read, path, moved, star, own)
         for axis, v in enumerate(self._read):
-            self.advection.keep_own(own[axis], v, path, axis, star[axis])
+            read = v if kept is None else np.where(kept[axis], own[axis], v)
+            self.advection.keep_own(own[axis], read, path, axis, star[axis])
         self._start = each(np.copy, star)
 
     def change(self, change: Callable[[Faces], Faces]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
 from petfsi.errors import InputError
 from petfsi.fields.base import Slab
@@ -96,7 +95,7 @@ def probe(fluid: View, quantity: str, at: list[float]) -> float | np.ndarray:
 def _sides(fluid: View) -> list[np.ndarray] | None:
     """Return the velocity of cells, ghosts valid, by axis; None where there are no sheets. Collective."""
     sheets = fluid.sheets
-    if not fluid.grid.comm.allreduce(sheets is not None and sheets.any, op=MPI.LOR):
+    if sheets is None or not sheets.anywhere:
         return None
     arrays = []
     for column in cell_velocity(fluid):
