@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from petfsi.fields.mac.advect import keep_own, sweep
 from petfsi.fields.mac.extrapolate import LINEAR, on_line
 from petfsi.fields.mac.kinds import DEAD, NARROW, PRESSURE, SPLIT
 
@@ -119,7 +118,7 @@ def reach_pieces(cut, base, start, piece, pick, queue):
                 if kind == PRESSURE:
                     to = 0
                 elif kind == SPLIT:
-                    to = _through(links, firsts[face + side * up[a]], here, side)
+                    to = through(links, firsts[face + side * up[a]], here, side)
                 if to >= 0:
                     picked[beside] = to
                     queue[tail, 0], queue[tail, 1] = beside, i + step * (a == 0)
@@ -128,41 +127,7 @@ def reach_pieces(cut, base, start, piece, pick, queue):
 
 
 @njit(cache=True)
-def lead_around(cut, cells, pieces, reach):
-    """Return which further pieces water leads around to from the first ones of their cells within so many cells.
-
-    Parameters
-    ----------
-    cut : Cut
-    cells, pieces : ndarray of int64, shape (n, 3), (n,)
-    reach : int
-    """
-    dim = cut.dim
-    pick, queue = _search_room(reach, dim)
-    links = cut.ends, cut.below, cut.above, cut.part
-    mid = reach + MARGIN
-    deep = mid if dim == 3 else 0
-    found = np.zeros(len(cells), np.bool_)
-    for n in range(len(cells)):
-        c = (cells[n, 0], cells[n, 1], cells[n, 2])
-        reach_pieces(cut, (c[0] - mid, c[1] - mid, c[2] - deep), (mid, mid, deep), pieces[n], pick, queue)
-        for a in range(dim):
-            for side in range(2):
-                f = (c[0] + side * (a == 0), c[1] + side * (a == 1), c[2] + side * (a == 2))
-                to = -1
-                if cut.kind[a][f] == PRESSURE:
-                    to = 0
-                elif cut.kind[a][f] == SPLIT:
-                    to = _through(links, cut.first[a][f], 0, side)
-                step = 2 * side - 1
-                w = (mid + step * (a == 0), mid + step * (a == 1), deep + step * (a == 2))
-                if to >= 0 and pick[w] == to:
-                    found[n] = True
-    return found
-
-
-@njit(cache=True)
-def _through(links, first, piece, up):
+def through(links, first, piece, up):
     """Return the piece on the other side of a divided face that the widest link from a piece leads to; -1 for none."""
     ends, lower, upper, part = links
     best, width = -1, 0.0
@@ -191,7 +156,7 @@ def _link_of(links, first, below, above):
 
 
 @njit(cache=True)
-def _inside(cut, base, shape):
+def is_inside(cut, base, shape):
     """Return whether the cells and faces of a chart, but for its margin, all lie in the domain."""
     for b in range(cut.dim):
         if base[b] + MARGIN < cut.low[b] or base[b] + shape[b] - MARGIN > cut.high[b]:
@@ -226,7 +191,7 @@ def fill_faces(cut, a, base, pick, values, parts, known, q, layer, todo):
     n0, n1, n2 = q.shape
     kind, narrow, first = cut.kind[a], cut.narrow[a], cut.first[a]
     links, low, high, dim = (cut.ends, cut.below, cut.above, cut.part), cut.low, cut.high, cut.dim
-    whole = _inside(cut, base, q.shape)
+    whole = is_inside(cut, base, q.shape)
     di, dj, dk = int(a == 0), int(a == 1), int(a == 2)
     deep = MARGIN if dim == 3 else 0
     some = slivers = left = 0
@@ -296,7 +261,7 @@ def _pass_slivers(a, dim, layer, todo, left):
 def fill_cells(cut, base, pick, values, extras, q, layer, todo):
     """Fill a chart of cells, as ``fill_faces`` does one of faces; what is not a number is not known."""
     n0, n1, n2 = q.shape
-    whole = _inside(cut, base, q.shape)
+    whole = is_inside(cut, base, q.shape)
     low, high, dim, extra = cut.low, cut.high, cut.dim, cut.extra
     deep = MARGIN if dim == 3 else 0
     some = left = 0
@@ -407,254 +372,36 @@ def complete_faces(cut, a, base, pick, values, parts, known, q, layer, todo):
     some, left = fill_faces(cut, a, base, pick, values, parts, known, q, layer, todo)
     if some > 0:
         extend(q, layer, cut.dim, True, todo, left)
-        if not _inside(cut, base, q.shape):
+        if not is_inside(cut, base, q.shape):
             clamp_faces(cut, a, base, q, layer)
     return some > 0
 
 
 @njit(cache=True)
-def _room(reach, dim, a, value):
+def room(reach, dim, a, value):
     """Return a chart of the faces of an axis (cells: 3) around a cell, with a margin, full of a value."""
     n = 2 * (reach + MARGIN) + 1
     return np.full((n + (a == 0), n + (a == 1), n + (a == 2) if dim == 3 else 1), value)
 
 
 @njit(cache=True)
-def _search_room(reach, dim):
+def search_room(reach, dim):
     """Return room for a search: which pieces are reached, and a queue."""
-    pick = _room(reach, dim, 3, np.int8(-2))
+    pick = room(reach, dim, 3, np.int8(-2))
     return pick, np.empty((pick.size, 4), np.int64)
 
 
 @njit(cache=True)
-def _layers(reach, dim):
+def empty_layers(reach, dim):
     """Return empty layers for charts of faces of each axis, and of cells."""
     none = np.int8(BEYOND)
     return (
-        _room(reach, dim, 0, none), _room(reach, dim, 1, none), _room(reach, dim, 2, none), _room(reach, dim, 3, none),
+        room(reach, dim, 0, none), room(reach, dim, 1, none), room(reach, dim, 2, none), room(reach, dim, 3, none),
     )  # fmt: skip
 
 
 @njit(cache=True)
-def _rooms(reach, dim):
+def empty_charts(reach, dim):
     """Return empty charts of the faces of each axis; in 2D the third is another of the first."""
     last = 2 if dim == 3 else 0
-    return (_room(reach, dim, 0, 0.0), _room(reach, dim, 1, 0.0), _room(reach, dim, last, 0.0))
-
-
-@njit(cache=True)
-def _limits(low, high, base, w, crossed):
-    """Return the ends of the domain in a chart, no farther from a target than the chart is made for."""
-    lows = (
-        max(low[0] - base[0], float(w[0] - crossed)), max(low[1] - base[1], float(w[1] - crossed)),
-        max(low[2] - base[2], float(w[2] - crossed)),
-    )  # fmt: skip
-    highs = (
-        min(high[0] - base[0], w[0] + crossed + 1.0), min(high[1] - base[1], w[1] + crossed + 1.0),
-        min(high[2] - base[2], w[2] + crossed + 1.0),
-    )  # fmt: skip
-    return lows, highs
-
-
-@njit(cache=True)
-def carry_faces(
-    cut, cells, pieces, reach, same, path, path_parts, faces, parts, known, from_below, moved, courant, low,
-    high, cubic, keep, own_faces, out, out_parts, done, kept,
-):  # fmt: skip
-    """Carry what is on faces to those of some pieces near sheets, each along its own side.
-
-    Parameters
-    ----------
-    cut : Cut
-    cells : ndarray of int64, shape (n, 3)
-        Local cells.
-    pieces : ndarray of int64, shape (n,)
-    reach : int
-        Cells that the flow crosses, and the stencil.
-    same : bool
-        Whether what is carried is the path's own velocity.
-    path, path_parts, faces, parts
-        Velocity of the path and what is carried: three face arrays, and values of links.
-    known, from_below : ndarray of bool, shape (n_links,)
-        Which of the latter may be read; whether a link sees what its piece below sees.
-    moved, courant, low, high, cubic
-        As for ``advect.sweep``; a mask per axis.
-    keep : bool
-        Whether what targets have beyond the values that are read stays with them, see ``advect.keep_own``.
-    own_faces : tuple of three ndarray
-        What faces have themselves.
-    out, out_parts
-        What is carried to plain faces and to links.
-    done : ndarray of bool, shape (n_links,)
-        Set where that was written.
-    kept : tuple of three ndarray of bool
-        Set where faces were told to keep their own.
-    """
-    dim = cut.dim
-    pick, queue = _search_room(reach, dim)
-    todo = np.empty(2 * pick.size, np.int64)
-    flow, carried, new, own = _rooms(reach, dim), _rooms(reach, dim), _rooms(reach, dim), _rooms(reach, dim)
-    layer = _layers(reach, dim)
-    every = (np.ones(new[0].shape, np.bool_), np.ones(new[1].shape, np.bool_), np.ones(new[2].shape, np.bool_))
-    some = np.zeros(3, np.bool_)
-    mid = reach + MARGIN
-    deep, crossed = mid if dim == 3 else 0, reach - (2 if cubic else 1)
-    start = (mid, mid, deep)
-    for n in range(len(cells)):
-        c, piece = (cells[n, 0], cells[n, 1], cells[n, 2]), pieces[n]
-        base = (c[0] - mid, c[1] - mid, c[2] - deep)
-        reach_pieces(cut, base, start, piece, pick, queue)
-        for a in range(dim):
-            some[a] = complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
-        for a in range(dim):
-            if same:
-                q = flow[a]
-            else:
-                q = carried[a]
-                some[a] = complete_faces(cut, a, base, pick, faces[a], parts, known, q, layer[a], todo)
-            if not some[a]:
-                continue
-            offset = (0.5 * (a != 0), 0.5 * (a != 1), 0.5 * (a != 2))
-            for up in range(2):
-                f = (c[0] + up * (a == 0), c[1] + up * (a == 1), c[2] + up * (a == 2))
-                w = (start[0] + up * (a == 0), start[1] + up * (a == 1), start[2] + up * (a == 2))
-                divided = cut.kind[a][f] == SPLIT
-                if not divided:
-                    ends = up == 0 or c[a] == cut.high[a] - 1
-                    if not ends or cut.kind[a][f] == DEAD or not moved[a][f]:
-                        continue
-                elif not _leads(cut, cut.first[a][f], piece, up, from_below):
-                    continue
-                part = ((w[0], w[0] + 1), (w[1], w[1] + 1), (w[2], w[2] + 1))
-                lows, highs = _limits(low, high, base, w, crossed)
-                sweep(
-                    q, new[a], every[a], flow[0], flow[1], flow[2], offset, part, courant, lows, highs, 0.0, cubic,
-                    False,
-                )  # fmt: skip
-                value, first = new[a][w], cut.first[a][f] if divided else 0
-                for link in range(first, cut.ends[first] if divided else 1):
-                    if divided:
-                        if from_below[link] != (up == 1) or piece != (cut.below[link] if up else cut.above[link]):
-                            continue
-                    if keep:
-                        own[a][w], new[a][w] = parts[link] if divided else own_faces[a][f], value
-                        keep_own(new[a], own[a], q, flow[0], flow[1], flow[2], offset, part, courant)
-                    if divided:
-                        out_parts[link], done[link] = new[a][w], True
-                    else:
-                        out[a][f], kept[a][f] = new[a][w], keep
-
-
-@njit(cache=True)
-def _leads(cut, first, piece, up, from_below):
-    """Return whether any link of a divided face sees what a piece next to it sees."""
-    for link in range(first, cut.ends[first]):
-        if from_below[link] == (up == 1) and piece == (cut.below[link] if up else cut.above[link]):
-            return True
-    return False
-
-
-@njit(cache=True)
-def carry_cells(
-    cut, cells, pieces, reach, path, path_parts, known, smoke, extras, courant, low, high, beyond, cubic, out,
-    out_extras, done,
-):  # fmt: skip
-    """Carry smoke to some pieces near sheets; see ``carry_faces``.
-
-    Parameters
-    ----------
-    smoke, extras : ndarray
-        Cell array, and values of the further pieces.
-    beyond : float
-        As ``reach`` for ``advect.sweep``.
-    """
-    dim = cut.dim
-    pick, queue = _search_room(reach, dim)
-    todo = np.empty(2 * pick.size, np.int64)
-    flow, q, new = _rooms(reach, dim), _room(reach, dim, 3, 0.0), _room(reach, dim, 3, 0.0)
-    layer, every = _layers(reach, dim), np.ones(new.shape, np.bool_)
-    mid = reach + MARGIN
-    deep, crossed = mid if dim == 3 else 0, reach - (2 if cubic else 1)
-    w = (mid, mid, deep)
-    part = ((w[0], w[0] + 1), (w[1], w[1] + 1), (w[2], w[2] + 1))
-    for n in range(len(cells)):
-        c, piece = (cells[n, 0], cells[n, 1], cells[n, 2]), pieces[n]
-        base = (c[0] - mid, c[1] - mid, c[2] - deep)
-        reach_pieces(cut, base, w, piece, pick, queue)
-        for a in range(dim):
-            complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
-        _, left = fill_cells(cut, base, pick, smoke, extras, q, layer[3], todo)
-        extend(q, layer[3], dim, False, todo, left)
-        if not _inside(cut, base, q.shape):
-            clamp_cells(cut, base, pick, smoke, q, layer[3])
-        lows, highs = _limits(low, high, base, w, crossed)
-        sweep(
-            q, new, every, flow[0], flow[1], flow[2], (0.5, 0.5, 0.5), part, courant, lows, highs, beyond, cubic, True,
-        )  # fmt: skip
-        if piece == 0:
-            out[c] = new[w]
-        else:
-            row = cut.extra[c] + piece - 1
-            out_extras[row], done[row] = new[w], True
-
-
-@njit(cache=True)
-def guess_links(cut, rows, axis, cells, pieces, up, reach, faces, parts, known, out):
-    """Extrapolate what is on some links from what is known on their own sides; leave it where nothing is.
-
-    Parameters
-    ----------
-    cut : Cut
-    rows, axis : ndarray of int64, shape (n,)
-        The links.
-    cells, pieces, up : ndarray of int64, shape (n, 3), (n,), (n,)
-        A piece that each touches, in a local cell, and whether it lies above that.
-    reach : int
-    faces, parts, known
-        As for ``carry_faces``.
-    out : ndarray, shape (n_links,)
-    """
-    dim = cut.dim
-    pick, queue = _search_room(reach, dim)
-    todo = np.empty(2 * pick.size, np.int64)
-    chart, layer = _rooms(reach, dim), _layers(reach, dim)
-    mid = reach + MARGIN
-    deep = mid if dim == 3 else 0
-    for n in range(len(rows)):
-        a = axis[n]
-        base = (cells[n, 0] - mid, cells[n, 1] - mid, cells[n, 2] - deep)
-        reach_pieces(cut, base, (mid, mid, deep), pieces[n], pick, queue)
-        if complete_faces(cut, a, base, pick, faces[a], parts, known, chart[a], layer[a], todo):
-            w = (mid + up[n] * (a == 0), mid + up[n] * (a == 1), deep + up[n] * (a == 2))
-            if layer[a][w] != UNKNOWN:
-                out[rows[n]] = chart[a][w]
-
-
-@njit(cache=True)
-def guess_cells(cut, cells, pieces, reach, smoke, extras):
-    """Return the means of what is known around some pieces on their own sides; not a number where nothing is.
-
-    Parameters
-    ----------
-    cut : Cut
-    cells, pieces : ndarray of int64, shape (n, 3), (n,)
-    reach : int
-    smoke, extras : ndarray
-        Cell array, and values of further pieces; not numbers where not known.
-    """
-    dim = cut.dim
-    pick, queue = _search_room(reach, dim)
-    q, layer, todo = _room(reach, dim, 3, 0.0), _layers(reach, dim)[3], np.empty(pick.size, np.int64)
-    mid = reach + MARGIN
-    deep = mid if dim == 3 else 0
-    w = (mid, mid, deep)
-    out = np.full(len(cells), np.nan)
-    for n in range(len(cells)):
-        base = (cells[n, 0] - mid, cells[n, 1] - mid, cells[n, 2] - deep)
-        reach_pieces(cut, base, w, pieces[n], pick, queue)
-        some, left = fill_cells(cut, base, pick, smoke, extras, q, layer, todo)
-        if some > 0:
-            extend(q, layer, dim, False, todo, left)
-            if layer[w] != UNKNOWN:
-                out[n] = q[w]
-    return out
+    return (room(reach, dim, 0, 0.0), room(reach, dim, 1, 0.0), room(reach, dim, last, 0.0))

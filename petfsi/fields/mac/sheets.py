@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.fields.mac import charts, kinds, thin
+from petfsi.fields.mac import charts, kinds, sided, thin
 from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid, three
 from petfsi.fields.mac.parts import LocalParts, Parts, ranges
@@ -66,7 +66,7 @@ class Sheets:
         """Return this rank's own divided cells, but those whose further pieces are slight and joined with the first."""
         local, table = self.local, self.table
         cells = np.column_stack(np.unravel_index(local.piece_cell, self.grid.shape(None))).reshape(-1, 3)
-        around = charts.lead_around(self.cut, cells.astype(np.int64), table.piece[local.pieces], thin.AROUND[0])
+        around = sided.lead_around(self.cut, cells.astype(np.int64), table.piece[local.pieces], thin.AROUND[0])
         slight = around & (table.volume[local.pieces] < thin.SLIGHT)
         return tuple(cells[~slight].T)
 
@@ -127,7 +127,7 @@ class Sheets:
         self, faces: Faces, path: Faces, moved: list[np.ndarray], courant: tuple, reach: int, low: tuple, high: tuple,
         cubic: bool, own: Faces | None, out: Faces,
     ) -> list[np.ndarray]:  # fmt: skip
-        """Carry what is on faces along a path, near sheets; see ``charts.carry_faces``. Collective.
+        """Carry what is on faces along a path, near sheets; see ``sided.carry_faces``. Collective.
 
         Returns which faces have kept what they have of their ``own``.
         """
@@ -136,7 +136,7 @@ class Sheets:
         done = np.zeros(len(self.table), dtype=bool)
         if self.any:
             targets = self._in_need(reach, True, path, (courant, low, high), 0.0, cubic)
-            charts.carry_faces(
+            sided.carry_faces(
                 self.cut, *targets, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
                 self._known, self.from_below, three(moved), courant, low, high, cubic, own is not None,
                 three(faces if own is None else own), three(out), out.parts, done, three(kept),
@@ -154,7 +154,7 @@ class Sheets:
         done = np.zeros(len(extras), dtype=bool)
         if self.any:
             targets = self._in_need(reach, False, path, (courant, low, high), beyond, cubic)
-            charts.carry_cells(
+            sided.carry_cells(
                 self.cut, *targets, reach, three(path), path.parts, self._known, smoke, extras, courant, low, high,
                 beyond, cubic, out, further, done,
             )  # fmt: skip
@@ -182,7 +182,7 @@ class Sheets:
             rows, cell, up = rows[use], cell[use].astype(np.int64), up[use].astype(np.int64)
             pieces = np.where(up == 1, table.below[rows], table.above[rows])
             axis = np.full(len(rows), a)
-            charts.guess_links(
+            sided.guess_links(
                 self.cut, rows, axis, cell, pieces, up, AROUND, three(faces), faces.parts, known, out
             )  # fmt: skip
             mine.append(rows)
@@ -209,7 +209,7 @@ class Sheets:
         others = np.column_stack(np.unravel_index(local.piece_cell[use], grid.shape(None))).reshape(-1, 3)
         pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[rows]))
         where = np.concatenate((cells, others)).astype(np.int64)
-        guess = np.nan_to_num(charts.guess_cells(self.cut, where, pieces, AROUND, smoke, extras))
+        guess = np.nan_to_num(sided.guess_cells(self.cut, where, pieces, AROUND, smoke, extras))
         smoke, extras = smoke.copy(), extras.copy()
         smoke[tuple(cells.T)] = guess[: len(cells)]
         grid.exchange_cells(smoke)
@@ -250,7 +250,7 @@ class Sheets:
             at = tuple(place.T)
             values = array[at]
             n = len(place)
-            charts.guess_links(
+            sided.guess_links(
                 cut, np.arange(n), np.full(n, a), cell, np.zeros(n, np.int64), up, AROUND, three(new),
                 new.parts, self._known, values,
             )  # fmt: skip
@@ -264,7 +264,7 @@ class Sheets:
         part, fresh = self.grid.owned(None), fresh & self._close
         cells = (np.argwhere(fresh[part]) + [s.start for s in part]).astype(np.int64)
         known = np.where(fresh, np.nan, smoke)
-        guess = charts.guess_cells(self.cut, cells, np.zeros(len(cells), np.int64), AROUND, known, extras)
+        guess = sided.guess_cells(self.cut, cells, np.zeros(len(cells), np.int64), AROUND, known, extras)
         new, use = smoke.copy(), ~np.isnan(guess)
         new[tuple(cells[use].T)] = guess[use]
         self.grid.exchange_cells(new)
