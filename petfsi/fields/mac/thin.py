@@ -137,7 +137,7 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, low, hig
     """Return which cells' paths, as the grid has them, read what may be of the other side of a sheet.
 
     A path that reads whole cells of open water alone, all joined with each other, or no wall that is thin, needs no
-    more than the grid.
+    more than the grid. Of a thin wall that it reads, the cell beside it on its own side is among those, or next to one.
 
     Parameters
     ----------
@@ -185,6 +185,6 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, low, hig
         if not _any(odd, begin, end):
             continue
         for b in range(dim):
-            begin[b], end[b] = max(begin[b] - THICKEST, 0), min(end[b] + THICKEST, odd.shape[b] - 1)
+            begin[b], end[b] = max(begin[b] - 1, 0), min(end[b] + 1, odd.shape[b] - 1)
         need[n] = divided[n] or _any(near, begin, end)
     return need
