@@ -145,29 +145,36 @@ class MacFluid(CoveredGrid):
         old, grid = self.sheets, self.grid
         self.sheets = self._sheets_of(parts)
         self._transport.advection.sheets = self.sheets
-        if old is not None and (len(parts) or len(old.table)):
+        if old is None:
+            return
+        self._mark_uncovered(old, self.sheets, old_kind, other)
+        if len(parts) or len(old.table):
             self._go_on(Lineage(grid, old, self.sheets, old_kind))
-        if old is not None and self.sheets.anywhere:
-            self._renew(self.sheets, old_kind, other & ~old.divided)
+        if self.sheets.anywhere:
+            self._renew(self.sheets)
 
-    def _renew(self, sheets: Sheets, old_kind: list[np.ndarray], other: np.ndarray) -> None:
+    def _mark_uncovered(self, old: Sheets, new: Sheets, old_kind: list[np.ndarray], other: np.ndarray) -> None:
+        """Tell the new sheets what thin walls have just uncovered: nothing may be read from there."""
+        if not new.anywhere:
+            return
+        new.flipped = new.close & other & (self.cell_kind == kinds.FLUID) & ~new.divided & ~old.divided
+        for a, (before, now) in enumerate(zip(old_kind, self.face_kind, strict=True)):
+            fresh = (before == kinds.DEAD) | beside(new.flipped, a)
+            new.fresh[a][...] = beside(new.close, a) & fresh & ((now == kinds.PRESSURE) | (now == kinds.OPEN))
+
+    def _renew(self, sheets: Sheets) -> None:
         """Give what thin walls have just uncovered the values of its own side. Collective."""
-        flipped = other & (self.cell_kind == kinds.FLUID) & ~sheets.divided
-        fresh = [
-            ((old == kinds.DEAD) | beside(flipped, a)) & ((new == kinds.PRESSURE) | (new == kinds.OPEN))
-            for a, (old, new) in enumerate(zip(old_kind, self.face_kind, strict=True))
-        ]
-        found = np.array([any(map(np.any, fresh)), flipped.any()], dtype=int)
+        found = np.array([any(map(np.any, sheets.fresh)), sheets.flipped.any()], dtype=int)
         faces_are, cells_are = self.comm.allreduce(found) > 0
 
         def renewed(faces: Faces) -> Faces:
-            return sheets.renew_faces(faces, fresh)
+            return sheets.renew_faces(faces, sheets.fresh)
 
         if faces_are:
             self.velocity, self.velocity_star = renewed(self.velocity), renewed(self.velocity_star)
             self._transport.change(renewed)
         if cells_are and self.smoke is not None:
-            self.smoke = sheets.renew_smoke(self.smoke, self.smoke_parts, flipped)
+            self.smoke = sheets.renew_smoke(self.smoke, self.smoke_parts, sheets.flipped)
             self._complete_cells(self.smoke)
 
     def _sheets_of(self, parts: Parts) -> Sheets:

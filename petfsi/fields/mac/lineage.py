@@ -113,6 +113,7 @@ class Lineage:
         total = np.concatenate(([0.0], np.cumsum(table.volume)))
         aside = volume.reshape(-1)[flat] - (total[others[1]] - total[others[0]])[which] <= CENTRE
         whole.reshape(-1)[flat[aside]] = np.nan
+        whole[self.new.flipped] = np.nan
         further = np.full(len(source), np.nan)
         went = source >= 0
         further[went] = extras[source[went]]

@@ -58,6 +58,9 @@ class Sheets:
         #: Whether there is any sheet near this rank, and near any rank.
         self.any = bool(near.any() or self.divided.any())
         self.anywhere = bool(grid.comm.allreduce(self.any, op=MPI.LOR))
+        #: What walls have just uncovered: faces by axis, and cells, also those that were other water's.
+        self.fresh = [np.zeros(kind.shape, dtype=bool) for kind in face_kind]
+        self.flipped = np.zeros(cell_kind.shape, dtype=bool)
         self.from_below = self._ends()
         self._known = np.ones(len(table), dtype=bool)
         self._targets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -166,7 +169,7 @@ class Sheets:
         """Extrapolate the links that are not ``known`` from their own sides; all ghosts are valid. Collective."""
         if known.all():
             return
-        grid, table = self.grid, self.table
+        grid, table, cut = self.grid, self.table, self._without(self.fresh)
         out, mine = faces.parts.copy(), []
         for a in range(grid.dim):
             flat, which = self.local.faces[a]
@@ -183,7 +186,7 @@ class Sheets:
             pieces = np.where(up == 1, table.below[rows], table.above[rows])
             axis = np.full(len(rows), a)
             sided.guess_links(
-                self.cut, rows, axis, cell, pieces, up, AROUND, three(faces), faces.parts, known, out
+                cut, rows, axis, cell, pieces, up, AROUND, three(faces), faces.parts, known, out
             )  # fmt: skip
             mine.append(rows)
         faces.parts = self.local.gathered(out, np.concatenate(mine))
@@ -199,7 +202,7 @@ class Sheets:
             Of further pieces.
         """
         grid, local = self.grid, self.local
-        unknown = np.isnan(smoke) & (local.extra >= 0)
+        unknown = np.isnan(smoke)
         if not grid.comm.allreduce(bool(unknown.any() or np.isnan(extras).any()), op=MPI.LOR):
             return smoke, extras
         part = grid.owned(None)
@@ -234,7 +237,7 @@ class Sheets:
         fresh : list of ndarray of bool
             Face arrays. Those far from sheets stay as they are.
         """
-        grid, close = self.grid, self._close
+        grid, close = self.grid, self.close
         fresh = [marked & beside(close, a) for a, marked in enumerate(fresh)]
         cut = self._without(fresh)
         new = Faces([array.copy() for array in faces], faces.parts)
@@ -261,7 +264,7 @@ class Sheets:
 
     def renew_smoke(self, smoke: np.ndarray, extras: np.ndarray, fresh: np.ndarray) -> np.ndarray:
         """Return smoke with the cells that walls have just uncovered given the mean of their own side. Collective."""
-        part, fresh = self.grid.owned(None), fresh & self._close
+        part, fresh = self.grid.owned(None), fresh & self.close
         cells = (np.argwhere(fresh[part]) + [s.start for s in part]).astype(np.int64)
         known = np.where(fresh, np.nan, smoke)
         guess = sided.guess_cells(self.cut, cells, np.zeros(len(cells), np.int64), AROUND, known, extras)
@@ -271,7 +274,7 @@ class Sheets:
         return new
 
     @cached_property
-    def _close(self) -> np.ndarray:
+    def close(self) -> np.ndarray:
         """Cell array: cells near sheets and those next to them."""
         close = self.near
         for b in range(self.grid.dim):
