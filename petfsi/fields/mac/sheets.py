@@ -235,11 +235,9 @@ class Sheets:
         ----------
         faces : Faces
         fresh : list of ndarray of bool
-            Face arrays. Those far from sheets stay as they are.
+            Face arrays.
         """
-        grid, close = self.grid, self.close
-        fresh = [marked & beside(close, a) for a, marked in enumerate(fresh)]
-        cut = self._without(fresh)
+        grid, cut = self.grid, self._without(fresh)
         new = Faces([array.copy() for array in faces], faces.parts)
         for a, array in enumerate(new):
             grid.exchange_faces(a, array)
@@ -264,7 +262,7 @@ class Sheets:
 
     def renew_smoke(self, smoke: np.ndarray, extras: np.ndarray, fresh: np.ndarray) -> np.ndarray:
         """Return smoke with the cells that walls have just uncovered given the mean of their own side. Collective."""
-        part, fresh = self.grid.owned(None), fresh & self.close
+        part = self.grid.owned(None)
         cells = (np.argwhere(fresh[part]) + [s.start for s in part]).astype(np.int64)
         known = np.where(fresh, np.nan, smoke)
         guess = sided.guess_cells(self.cut, cells, np.zeros(len(cells), np.int64), AROUND, known, extras)
