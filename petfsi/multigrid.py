@@ -18,9 +18,11 @@ M. Mohr and R. Wienands, Cell-centred multigrid revisited, Computing and Visuali
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
@@ -153,7 +155,7 @@ class Hierarchy:
         self._extra_cells = np.zeros(0, dtype=np.int64)
         level, fine = self._lattice, self._lattice.layout(self.comm.rank)
         while max(level.cells) > COARSEST:
-            self.transfers.append(self._transfer(level, level.halved(), fine, np.zeros(0, dtype=np.int64)))
+            self.transfers.append(self._transfer(level, fine, np.zeros(0, dtype=np.int64)))
             level = level.halved()
             fine = level.layout(self.comm.rank)
         self.follow(fluid)
@@ -170,43 +172,69 @@ class Hierarchy:
         if not self.transfers or not self.comm.allreduce(not same) and self._layout is not None:
             return
         if self._layout is not None or fluid.extras is not None:
-            self.transfers[0] = self._transfer(self._lattice, self._lattice.halved(), fluid.layout, cells)
+            self.transfers[0] = self._transfer(self._lattice, fluid.layout, cells)
         self._layout, self._extra_cells = fluid.layout, cells
 
-    def _transfer(self, fine: Lattice, coarse: Lattice, rows: Layout, extras: np.ndarray) -> Transfer:
-        lines = _pairs(fine, fine.owned(self.comm.rank))
-        columns = coarse.layout(self.comm.rank)
-        near = coarse.numbers([parent for parent, _, _ in lines])
-        corners, weights = [], []
-        for corner in np.ndindex(*(2,) * len(lines)):
-            index = [line[bit] for line, bit in zip(lines, corner, strict=True)]
-            weight = np.ones(1)
-            for line, bit in zip(lines, corner, strict=True):
-                weight = ((line[2] if bit else 1 - line[2])[:, None] * weight[None, :]).ravel()
-            corners.append(coarse.numbers(index))
-            weights.append(weight)
-        number, weight = np.stack(corners, axis=1), np.stack(weights, axis=1)
-        linear = _aij(self.comm, rows, columns, number, weight, near[extras])
-        constant = _aij(self.comm, rows, columns, near[:, None], np.ones((len(near), 1)), near[extras])
-        return Transfer(linear, constant, regular=min(fine.cells) > COARSEST)
+    @cached_property
+    def _finest(self) -> tuple[_Rows, _Rows]:
+        return _interpolations(self._lattice, self._lattice.halved(), self.comm.rank)
+
+    def _transfer(self, fine: Lattice, rows: Layout, extras: np.ndarray) -> Transfer:
+        """Return the interpolations to a level's cells and, behind them, to extra unknowns in some of those."""
+        coarse, rank = fine.halved(), self.comm.rank
+        linear, constant = self._finest if fine is self._lattice else _interpolations(fine, coarse, rank)
+        columns, parents = coarse.layout(rank), constant.indices[extras]
+        return Transfer(
+            linear.matrix(self.comm, rows, columns, parents),
+            constant.matrix(self.comm, rows, columns, parents),
+            regular=min(fine.cells) > COARSEST,
+        )
 
 
-def _aij(
-    comm: object, rows: Layout, columns: Layout, number: np.ndarray, weight: np.ndarray, extras: np.ndarray
-) -> PETSc.Mat:
-    """Return a matrix with a few weights per row, equal columns of a row added up; extra rows hold a single one."""
-    order = np.argsort(number, axis=1, kind="stable")
-    number, weight = np.take_along_axis(number, order, 1), np.take_along_axis(weight, order, 1)
-    for k in range(number.shape[1] - 1, 0, -1):
-        twice = number[:, k] == number[:, k - 1]
-        weight[twice, k - 1] += weight[twice, k]
-        weight[twice, k] = 0.0
-    keep = weight > 0
-    counts = np.concatenate((keep.sum(axis=1), np.ones(len(extras), dtype=np.int64)))
-    indptr = np.concatenate(([0], np.cumsum(counts))).astype(IntType)
-    indices = np.concatenate((number[keep], extras)).astype(IntType)
-    values = np.concatenate((weight[keep], np.ones(len(extras))))
-    return PETSc.Mat().createAIJ((rows.sizes, columns.sizes), csr=(indptr, indices, values), comm=comm)
+@dataclass(frozen=True)
+class _Rows:
+    """A rank's rows of an interpolation, in compressed form; they stay while what is behind them changes."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def weighted(cls, number: np.ndarray, weight: np.ndarray) -> _Rows:
+        """Return rows with a few weights each, equal columns of a row added up."""
+        order = np.argsort(number, axis=1, kind="stable")
+        number, weight = np.take_along_axis(number, order, 1), np.take_along_axis(weight, order, 1)
+        for k in range(number.shape[1] - 1, 0, -1):
+            twice = number[:, k] == number[:, k - 1]
+            weight[twice, k - 1] += weight[twice, k]
+            weight[twice, k] = 0.0
+        keep = weight > 0
+        indptr = np.concatenate(([0], np.cumsum(keep.sum(axis=1)))).astype(IntType)
+        return cls(indptr, number[keep].astype(IntType), weight[keep])
+
+    def matrix(self, comm: MPI.Comm, rows: Layout, columns: Layout, extras: np.ndarray) -> PETSc.Mat:
+        """Return them as a matrix, and behind them rows that hold a single one each, in the given columns."""
+        ends = self.indptr[-1] + np.arange(1, len(extras) + 1)
+        indptr = np.concatenate((self.indptr, ends)).astype(IntType)
+        indices = np.concatenate((self.indices, extras)).astype(IntType)
+        values = np.concatenate((self.values, np.ones(len(extras))))
+        return PETSc.Mat().createAIJ((rows.sizes, columns.sizes), csr=(indptr, indices, values), comm=comm)
+
+
+def _interpolations(fine: Lattice, coarse: Lattice, rank: int) -> tuple[_Rows, _Rows]:
+    """Return the linear and the constant interpolation to a rank's cells of a level from the next coarser one."""
+    lines = _pairs(fine, fine.owned(rank))
+    near = coarse.numbers([parent for parent, _, _ in lines])
+    corners, weights = [], []
+    for corner in np.ndindex(*(2,) * len(lines)):
+        index = [line[bit] for line, bit in zip(lines, corner, strict=True)]
+        weight = np.ones(1)
+        for line, bit in zip(lines, corner, strict=True):
+            weight = ((line[2] if bit else 1 - line[2])[:, None] * weight[None, :]).ravel()
+        corners.append(coarse.numbers(index))
+        weights.append(weight)
+    linear = _Rows.weighted(np.stack(corners, axis=1), np.stack(weights, axis=1))
+    return linear, _Rows.weighted(near[:, None], np.ones((len(near), 1)))
 
 
 class Multigrid:

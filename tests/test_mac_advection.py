@@ -1,11 +1,14 @@
 """Semi-Lagrangian advection: exact where it must be, its order elsewhere, the same on any number of ranks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mac_cases import PERIODIC, make_fluid, set_velocity, whole, whole_state
 from mpi4py import MPI
 
-from petfsi.fields.mac import advect
+from petfsi.fields.mac import advect, advection
+from petfsi.fields.mac.marks import faces_below
 
 
 def smoke_fluid(cells, smoke, comm=MPI.COMM_WORLD, **scene):
@@ -72,7 +75,10 @@ def test_uniform_flow_damps_a_wave_by_the_factor_of_linear_interpolation(courant
 
 @pytest.mark.parametrize("interpolation, order, last", [("linear", 1.0, 0.03), ("cubic", 1.2, 1.5e-3)])
 def test_a_blob_in_a_rotation_converges(interpolation, order, last):
-    """Cubics are cut at the blob's peak, to stay within the values around, and that costs order there."""
+    """Cubics are cut at the blob's peak, to stay within the values around, and that costs order there.
+
+    How much depends on where the peak lies between points, so the order is that of two refinements together.
+    """
     errors = []
     for n in (32, 64, 128):
         fluid = smoke_fluid((n, n), "exp(-((x-0.5)**2+(y-0.65)**2)/0.03)", advection=interpolation)
@@ -84,8 +90,7 @@ def test_a_blob_in_a_rotation_converges(interpolation, order, last):
         c, s = np.cos(1.0), np.sin(1.0)
         exact = np.exp(-((x - 0.5 + 0.15 * s) ** 2 + (y - 0.5 - 0.15 * c) ** 2) / 0.03)
         errors.append(np.abs(smoke(fluid) - exact)[np.hypot(x - 0.5, y - 0.5) < 0.45].max())
-    seen = np.diff(-np.log2(errors))
-    assert seen[-1] > order - 0.1, (errors, seen)
+    assert np.log2(errors[0] / errors[-1]) / 2 > order - 0.1, errors
     assert errors[-1] < last
 
 
@@ -106,14 +111,19 @@ def test_cubic_interpolation_is_exact_for_cubics(shape):
     out = np.full(shape, np.nan)
     flow = [np.full(tuple(n + (a == b) for b, n in enumerate(shape)), s) for a, s in enumerate(shift)]
     part = ((3, shape[0]), (0, shape[1] - 2), (0, 1) if flat else (1, shape[2]))
-    moved = np.ones(shape, dtype=bool)
+    moved, left = np.ones(shape, dtype=bool), np.zeros(shape, dtype=bool)
     low, high = (0.0, 0.0, 0.0), tuple(map(float, shape))
-    advect.sweep(q, out, moved, *flow, (0.5, 0.5, 0.5), part, (1.0, 1.0, 1.0), low, high, 0.5, True, False)
+    advect.sweep(
+        q, out, moved, *flow, (0.5, 0.5, 0.5), part, (1.0, 1.0, 1.0), False, low, high, 0.5, True, False, np.inf, left
+    )
     own = tuple(slice(*p) for p in part)
     np.testing.assert_allclose(out[own], product(shift)[own], atol=1e-13)
     steep = (np.indices(shape).sum(axis=0) > 15).astype(float)
     for bounded in (False, True):
-        advect.sweep(steep, out, moved, *flow, (0.5, 0.5, 0.5), part, (1.0, 1.0, 1.0), low, high, 0.5, True, bounded)
+        advect.sweep(
+            steep, out, moved, *flow, (0.5, 0.5, 0.5), part, (1.0, 1.0, 1.0), False, low, high, 0.5, True, bounded,
+            np.inf, left,
+        )  # fmt: skip
         assert (out[own].max() > 1.01) != bounded and (out[own].min() < -0.01) != bounded
 
 
@@ -186,12 +196,61 @@ def test_departure_points_never_index_wildly(cubic, bounded):
     q = np.ones((12, 12, 1))
     nan = np.full((13, 13, 1), np.nan)
     out = np.zeros_like(q)
-    moved = np.ones(q.shape, dtype=bool)
+    moved, left = np.ones(q.shape, dtype=bool), np.zeros(q.shape, dtype=bool)
     part, low, high = ((0, 12), (0, 12), (0, 1)), (0.0, 0.0, 0.0), (12.0, 12.0, 1.0)
     for bad in (nan, np.full_like(nan, np.inf), np.full_like(nan, -1e300)):
         advect.sweep(
-            q, out, moved, bad, bad, bad, (0.5, 0.5, 0.5), part, (1.0, 1.0, 0.0), low, high, 0.5, cubic, bounded
-        )
+            q, out, moved, bad, bad, bad, (0.5, 0.5, 0.5), part, (1.0, 1.0, 0.0), False, low, high, 0.5, cubic, bounded,
+            np.inf, left,
+        )  # fmt: skip
         np.testing.assert_allclose(out, 1.0, rtol=1e-14)
     assert not advect.all_finite(nan) and advect.all_finite(q)
     assert not advect.all_finite(np.array([[[1.0, -np.inf]]]))
+
+
+@pytest.mark.parallel([1, 2, 3, 4])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("sheet", [False, True], ids=["open", "sheet"])
+def test_what_is_too_fast_for_one_sweep_goes_as_if_all_went_in_several(dim, sheet, monkeypatch):
+    """Carrying all in short sweeps is the judge: a jet's entries must not read what was left out on their way."""
+    cells = (30, 24, 18)[:dim]
+    jet = "exp(-((y-0.6)/0.12)**2)"
+    wall = {"box": {"origin": [-1.0, 0.55, -1.0][:dim], "size": [1.5, 0.004, 3.0][:dim]}}
+
+    def run():
+        fluid = smoke_fluid(
+            cells,
+            "sin(7*x+3*y)",
+            sides={"left": "periodic", "right": "periodic", "top": "open"},
+            initial={"velocity": [f"0.2+{jet}", f"0.4*sin(2*pi*x)*{jet}", "0.3*cos(4*x)*y"][:dim]},
+            obstacles={"wall": {"shape": wall}} if sheet else {},
+        )
+        dt = 8.0 / fluid.cfl(1.0)
+        fluid.predict(0.0, dt)
+        seen.append([m.copy() for m in left])
+        left.clear()
+        return [v[fluid.grid.owned(a)].copy() for a, v in enumerate(fluid.velocity_star)], fluid
+
+    seen, left = [], []
+    rest = advection.Advection._rest
+
+    def watched(self, path, masks, axes, beyond):
+        if axes != [None]:
+            left.extend(m.copy() for m in masks)
+        return rest(self, path, masks, axes, beyond)
+
+    monkeypatch.setattr(advection.Advection, "_rest", watched)
+    got, fluid = run()
+    find = advection.find_path
+
+    def no_whole(*args):
+        path = find(*args)
+        return replace(path, whole=replace(path.whole, limit=-1.0))
+
+    monkeypatch.setattr(advection, "find_path", no_whole)
+    wanted, _ = run()
+    for a, (one, other) in enumerate(zip(got, wanted, strict=True)):
+        fast = faces_below(seen[0][a], a)[fluid.grid.owned(a)]
+        share = fluid.comm.allreduce(float(fast.sum())) / fluid.comm.allreduce(float(fast.size))
+        assert 0.01 < share < 0.5
+        assert np.abs(one - other)[fast].max(initial=0.0) < 1e-14

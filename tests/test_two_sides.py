@@ -365,3 +365,30 @@ def test_buoyancy_at_links_that_come_and_go_is_entered():
             tables.add(len(sim.fluid.sheets.table))
             assert np.all(np.isfinite(list(sim.accounts.values.values())))
         assert len(tables) > 1
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+def test_a_flow_too_fast_for_one_sweep_stays_on_its_side_of_a_sheet(integrator):
+    """Above the sheet a parallel flow from rest to seven cells a step, which is steady; below, rest."""
+    height, speed = 8.8 / N, 7.0 / N / 0.1
+    profile = f"{speed}*(y-{height})/{1 - height}"
+    scene = sheared(2, height, 0.002, integrator=integrator).model_dump(exclude_unset=True)
+    scene["fluid"] |= {
+        "initial": {"velocity": [f"where(y>{height},{profile},0)", "0"]},
+        "smoke": {"initial": f"where(y>{height},1+sin(2*pi*x),0)"},
+        "sides": {"left": "periodic", "right": "periodic"},
+    }
+    scene["time"] |= {"dt": 0.1}
+    with simulation(MPI.COMM_WORLD, Scene.model_validate(scene), DIRECT) as sim:
+        for _ in range(4):
+            sim.advance()
+        u, x = own_part(sim.fluid, sim.fluid.velocity[0], 0)
+        open_water = np.abs(x[1] - height) > 0.5 / N
+        exact = np.where(x[1] > height, speed * (x[1] - height) / (1 - height), 0.0)
+        assert np.abs(u - exact)[open_water].max(initial=0.0) < 1e-11
+        smoke, x = own_part(sim.fluid, sim.fluid.smoke, None)
+        above = x[1] > height + 0.5 / N
+        gone = speed * (x[1] - height) / (1 - height) * sim.time
+        assert np.abs(smoke - 1 - np.sin(2 * np.pi * (x[0] - gone)))[above].max(initial=0.0) < 0.06
+        assert np.abs(smoke[x[1] < height - 0.5 / N]).max(initial=0.0) == 0.0

@@ -1,8 +1,12 @@
 """Semi-Lagrangian advection on a staggered grid.
 
-The new value at x is the old one where the flow was a time step ago, with the midpoint rule for the path:
+The new value at x is the old one where the flow was a time step ago, with the midpoint rule for the path,
 
-    x_mid = x - dt/2 v(x),   x_dep = x - dt v(x_mid),   q_new(x) = q(x_dep) .
+    x_mid = x - dt/2 v(x),   x_dep = x - dt v(x_mid),   q_new(x) = q(x_dep) ,
+
+or, where a path is followed for longer than for a fast flow, with Ralston's rule of third order,
+
+    x_far = x - 3/4 dt v(x_mid),   x_dep = x - dt/9 (2 v(x) + 3 v(x_mid) + 4 v(x_far)) .
 
 Everything here is in index units of the local arrays: cell i reaches from i to i + 1, displacements are multiples
 of the cell size. The path follows velocities between grid points that are (bi-, tri-)linear; q at the departure point
@@ -166,23 +170,36 @@ def _velocity_of(u, v, w, i, j, k, offset, flat):
 
 
 @njit(cache=True, inline="always")
-def track_back(u, v, w, i, j, k, offset, courant, low, high, reach, flat):
-    """Return the middle and the begin of the path that ends at an entry; see ``sweep``, whose arguments these are."""
+def track_back(u, v, w, i, j, k, offset, courant, long, low, high, reach, flat):
+    """Return the begin of the path that ends at an entry, and the least and greatest coordinates on the way.
+
+    The arguments are those of ``sweep``.
+    """
     c0, c1, c2 = courant
     s0, s1, s2 = i + offset[0], j + offset[1], k + offset[2]
     a, b, c = _velocity_of(u, v, w, i, j, k, offset, flat)
     m0 = _clamp(s0 - 0.5 * c0 * a, low[0], high[0])
     m1 = _clamp(s1 - 0.5 * c1 * b, low[1], high[1])
     m2 = _clamp(s2 - 0.5 * c2 * c, low[2], high[2])
-    a, b, c = velocity_at(u, v, w, m0, m1, m2, flat)
-    d0 = _clamp(s0 - c0 * a, low[0] - reach, high[0] + reach)
-    d1 = _clamp(s1 - c1 * b, low[1] - reach, high[1] + reach)
-    d2 = _clamp(s2 - c2 * c, low[2] - reach, high[2] + reach)
-    return (m0, m1, m2), (d0, d1, d2)
+    l0, l1, l2 = min(s0, m0), min(s1, m1), min(s2, m2)
+    g0, g1, g2 = max(s0, m0), max(s1, m1), max(s2, m2)
+    am, bm, cm = velocity_at(u, v, w, m0, m1, m2, flat)
+    if long:
+        m0 = _clamp(s0 - 0.75 * c0 * am, low[0], high[0])
+        m1 = _clamp(s1 - 0.75 * c1 * bm, low[1], high[1])
+        m2 = _clamp(s2 - 0.75 * c2 * cm, low[2], high[2])
+        l0, l1, l2 = min(l0, m0), min(l1, m1), min(l2, m2)
+        g0, g1, g2 = max(g0, m0), max(g1, m1), max(g2, m2)
+        al, bl, cl = velocity_at(u, v, w, m0, m1, m2, flat)
+        am, bm, cm = (2 * a + 3 * am + 4 * al) / 9, (2 * b + 3 * bm + 4 * bl) / 9, (2 * c + 3 * cm + 4 * cl) / 9
+    d0 = _clamp(s0 - c0 * am, low[0] - reach, high[0] + reach)
+    d1 = _clamp(s1 - c1 * bm, low[1] - reach, high[1] + reach)
+    d2 = _clamp(s2 - c2 * cm, low[2] - reach, high[2] + reach)
+    return (d0, d1, d2), (min(l0, d0), min(l1, d1), min(l2, d2)), (max(g0, d0), max(g1, d1), max(g2, d2))
 
 
 @njit(cache=True)
-def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic, bounded):
+def sweep(q, out, moved, u, v, w, offset, part, courant, long, low, high, reach, cubic, bounded, limit, left):
     """Advect q by one step into ``out`` on a part of the grid.
 
     Parameters
@@ -190,7 +207,7 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
     q, out : ndarray
         Local arrays of faces or cells, old (with ghosts) and new.
     moved : ndarray of bool
-        Where to advect; elsewhere ``out`` is q.
+        Where to advect; elsewhere ``out`` is left as it is.
     u, v, w : ndarray
         Face arrays of the velocity, ghosts valid; in 2D w is not read.
     offset : tuple of float
@@ -199,6 +216,8 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
         Range of indices per axis to work on.
     courant : tuple of float
         dt / dx per axis; the displacement must not exceed four cells, or three if ``cubic``.
+    long : bool
+        Whether paths are of third order instead of second.
     low, high : tuple of float
         The domain (ghosts across ranks and periodic borders belong to it).
     reach : float
@@ -207,6 +226,10 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
         How q is interpolated.
     bounded : bool
         Whether cubic values are kept between those of the grid points around.
+    limit : float
+        Cells along any axis that a path may go; where it goes farther, ``out`` is left as it is, too.
+    left : ndarray of bool
+        Cell array: marked where that is so.
     """
     flat = q.shape[2] == 1
     (b0, e0), (b1, e1), (b2, e2) = part
@@ -215,15 +238,53 @@ def sweep(q, out, moved, u, v, w, offset, part, courant, low, high, reach, cubic
         for j in range(b1, e1):
             for k in range(b2, e2):
                 if not moved[i, j, k]:
-                    out[i, j, k] = q[i, j, k]
                     continue
-                _, (d0, d1, d2) = track_back(u, v, w, i, j, k, offset, courant, low, high, reach, flat)
-                d0, d1, d2 = d0 - h0, d1 - h1, d2 - h2
-                if cubic:
+                d, low_end, high_end = track_back(
+                    u, v, w, i, j, k, offset, courant, long, low, high, reach, flat
+                )  # fmt: skip
+                d0, d1, d2 = d[0] - h0, d[1] - h1, d[2] - h2
+                far = max(i + h0 - low_end[0], high_end[0] - i - h0, j + h1 - low_end[1], high_end[1] - j - h1)
+                if not flat:
+                    far = max(far, k + h2 - low_end[2], high_end[2] - k - h2)
+                if not far <= limit:
+                    left[i, j, k] = True
+                elif cubic:
                     value = _cubic(q, d0, d1, d2, flat)
                     out[i, j, k] = _within(value, q, d0, d1, d2, flat) if bounded else value
                 else:
                     out[i, j, k] = _interpolate(q, d0, d1, d2, flat)
+
+
+@njit(cache=True)
+def mark_read(read, there, but, u, v, w, offset, part, courant, low, high, reach, stencil):
+    """Mark the entries that a sweep reads along paths of second order for some of those on a part of the grid.
+
+    Parameters
+    ----------
+    read : ndarray of bool
+        Marked.
+    there, but : ndarray of bool
+        For which; for which not.
+    u, v, w, offset, part, courant, low, high, reach
+        As for ``sweep``.
+    stencil : int
+        Entries on either side of a point that are read.
+    """
+    flat = there.shape[2] == 1
+    (b0, e0), (b1, e1), (b2, e2) = part
+    n0, n1, n2 = read.shape
+    for i in range(b0, e0):
+        for j in range(b1, e1):
+            for k in range(b2, e2):
+                if not there[i, j, k] or but[i, j, k]:
+                    continue
+                (d0, d1, d2), _, _ = track_back(u, v, w, i, j, k, offset, courant, False, low, high, reach, flat)
+                f0, f1 = int(np.floor(d0 - offset[0])), int(np.floor(d1 - offset[1]))
+                f2 = 0 if flat else int(np.floor(d2 - offset[2]))
+                for a in range(max(f0 - stencil + 1, 0), min(f0 + stencil, n0 - 1) + 1):
+                    for b in range(max(f1 - stencil + 1, 0), min(f1 + stencil, n1 - 1) + 1):
+                        for c in range(max(f2 - stencil + 1, 0), min(f2 + stencil, n2 - 1) + 1):
+                            read[a, b, c] = True
 
 
 @njit(cache=True)

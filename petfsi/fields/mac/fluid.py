@@ -14,8 +14,9 @@ from petfsi.fields.mac.covered import CoveredGrid
 from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.faces import Faces, each
 from petfsi.fields.mac.lineage import Lineage
+from petfsi.fields.mac.marks import beside
 from petfsi.fields.mac.parts import Parts, read_whole, whole_slab
-from petfsi.fields.mac.sheets import Sheets, beside
+from petfsi.fields.mac.sheets import Sheets
 from petfsi.fields.mac.sides import evaluate_at, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight

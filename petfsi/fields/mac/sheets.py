@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +11,9 @@ from mpi4py import MPI
 from petfsi.fields.mac import charts, kinds, sided, thin
 from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.marks import beside, spread
 from petfsi.fields.mac.parts import LocalParts, Parts, ranges
+from petfsi.fields.mac.paths import Sweep
 
 #: Cells that an extrapolation looks at on either side.
 AROUND = 3
@@ -63,6 +66,7 @@ class Sheets:
         self.flipped = np.zeros(cell_kind.shape, dtype=bool)
         self.from_below = self._ends()
         self._known = np.ones(len(table), dtype=bool)
+        self._around: dict[int, np.ndarray] = {}
         self._targets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _dividing(self) -> tuple[np.ndarray, ...]:
@@ -92,14 +96,27 @@ class Sheets:
             several.append(count[which.ravel()] > 1)
         return (table.above < 0) | (several[1] & ~several[0] & (table.below >= 0))
 
+    def around(self, reach: int) -> np.ndarray:
+        """Return the cells that lie so near a sheet."""
+        if reach not in self._around:
+            near = self.near
+            for b in range(self.grid.dim):
+                near = spread(near, b, reach)
+            self._around[reach] = near | self.divided
+        return self._around[reach]
+
+    def holds(self, extras: np.ndarray) -> np.ndarray:
+        """Return the cells of which a further piece has a value that is not zero; ghosts valid."""
+        found = np.zeros(self.divided.shape, dtype=bool)
+        found.reshape(-1)[self.local.piece_cell[extras[self.local.pieces] != 0.0]] = True
+        self.grid.exchange_cells(found)
+        return found
+
     def _pieces(self, reach: int) -> tuple[np.ndarray, np.ndarray]:
         """Return this rank's pieces that lie so near a sheet: local cells (n, 3) and numbers."""
         if reach not in self._targets:
-            near = self.near
             part = self.grid.owned(None)
-            for b in range(self.grid.dim):
-                near = _spread(near, b, reach)
-            cells = np.argwhere((near[part] | self.divided[part]) & self._fluid[part]) + [s.start for s in part]
+            cells = np.argwhere(self.around(reach)[part] & self._fluid[part]) + [s.start for s in part]
             local = self.local
             others = np.column_stack(np.unravel_index(local.piece_cell, self.grid.shape(None))).reshape(-1, 3)
             pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[local.pieces]))
@@ -112,56 +129,89 @@ class Sheets:
         odd = thin.odd_cells(self._kind, self._narrow, self.divided, self._fluid, self._low, self._high)
         return thin.count_before(odd), thin.count_before(self.near)
 
-    def _in_need(
-        self, reach: int, faces: bool, path: Faces, limits: tuple, beyond: float, cubic: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return those of this rank's pieces whose paths meet sheets, and their numbers, see ``thin``."""
-        cells, pieces = self._pieces(reach)
+    def _turns(
+        self, sweep: Sweep, where: np.ndarray, faces: bool, path: Faces, low: tuple, high: tuple, beyond: float,
+        cubic: bool, left: list[np.ndarray],
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, int, float, list[np.ndarray]]]:  # fmt: skip
+        """Yield those of some cells whose paths meet sheets, see ``thin``, in turns by how far they go.
+
+        Cells, one piece of each, cells that charts reach, the limit to how far they may go, and where to mark those
+        that go farther along their own side: they have another turn, or in the end are ``left``.
+        """
+        cells, pieces = self._pieces(sweep.reach)
+        there = where[tuple(cells.T)]
+        cells, pieces = cells[there], pieces[there]
         divided, (odd, near) = self.divided[tuple(cells.T)], self._counts
-        courant, low, high = limits
-        need = thin.in_need(
-            odd, near, cells, divided, faces, self._high, three(path), courant, low, high, beyond, cubic, self.grid.dim
-        )
-        return cells[need], pieces[need]
+        far = thin.in_need(
+            odd, near, cells, divided, faces, self._high, three(path), sweep.courant, sweep.long, low, high, beyond,
+            cubic, self.grid.dim,
+        )  # fmt: skip
+        need = far >= 0.0
+        cells, pieces = cells[need], pieces[need]
+        stencil = 2 if cubic else 1
+        last = sweep.reach - stencil
+        turn = np.clip(np.ceil(far[need]), 1, last)
+        for n in range(1, last + 1):
+            now = turn == n
+            if not now.any():
+                continue
+            late = left if n == last else [np.zeros_like(mask) for mask in left]
+            yield cells[now], pieces[now], n + stencil, sweep.limit if n == last else float(n), late
+            if n < last:
+                place = tuple(cells.T)
+                turn[now & np.logical_or.reduce([mask[place] for mask in late])] = n + 1
 
     # ---- transport --------------------------------------------------------------------------------------------
 
+    def fastest(self, velocity: Faces) -> list[np.ndarray]:
+        """Return face arrays with the magnitude of its fastest part on each divided face."""
+        if not len(self.table):
+            return velocity
+        fastest = [v.copy() for v in velocity]
+        most = np.maximum.reduceat(np.abs(velocity.parts), self.table.first[:-1])
+        for array, (flat, which) in zip(fastest, self.local.faces, strict=True):
+            array.reshape(-1)[flat] = most[which]
+        return fastest
+
     def carry_faces(
-        self, faces: Faces, path: Faces, moved: list[np.ndarray], courant: tuple, reach: int, low: tuple, high: tuple,
-        cubic: bool, own: Faces | None, out: Faces,
-    ) -> list[np.ndarray]:  # fmt: skip
+        self, faces: Faces, path: Faces, moved: list[np.ndarray], sweep: Sweep, where: list[np.ndarray] | None,
+        low: tuple, high: tuple, cubic: bool, own: Faces | None, out: Faces, left: list[np.ndarray],
+        kept: list[np.ndarray],
+    ) -> None:  # fmt: skip
         """Carry what is on faces along a path, near sheets; see ``sided.carry_faces``. Collective.
 
-        Returns which faces have kept what they have of their ``own``.
+        Those that come from too far are marked as ``left``, by axis in the cells above or, where divided, to whose
+        pieces they belong; faces that have kept what they have of their ``own`` as ``kept``.
         """
-        kept = [np.zeros(v.shape, dtype=bool) for v in out]
-        out.parts = faces.parts.copy()
         done = np.zeros(len(self.table), dtype=bool)
         if self.any:
-            targets = self._in_need(reach, True, path, (courant, low, high), 0.0, cubic)
-            sided.carry_faces(
-                self.cut, *targets, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
-                self._known, self.from_below, three(moved), courant, low, high, cubic, own is not None,
-                three(faces if own is None else own), three(out), out.parts, done, three(kept),
-            )  # fmt: skip
+            own_faces = three(faces if own is None else own)
+            masks = [np.ones(self._fluid.shape, dtype=bool)] * len(left) if where is None else where
+            some = np.logical_or.reduce(masks)
+            for cells, pieces, reach, limit, late in self._turns(sweep, some, True, path, low, high, 0.0, cubic, left):
+                sided.carry_faces(
+                    self.cut, cells, pieces, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
+                    self._known, self.from_below, three(moved), three(masks), sweep.courant, sweep.long, low, high,
+                    cubic, own is not None, own_faces, limit, three(out), out.parts, done, three(late), three(kept),
+                )  # fmt: skip
         out.parts = self.local.gathered(out.parts, np.flatnonzero(done))
         self.local.mean_into(out, out.parts)
-        return kept
 
     def carry_smoke(
-        self, smoke: np.ndarray, extras: np.ndarray, path: Faces, courant: tuple, reach: int, low: tuple, high: tuple,
-        beyond: float, cubic: bool, out: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """Carry smoke along a path, near sheets; return that of the further pieces. Collective."""
-        further = extras.copy()
+        self, smoke: np.ndarray, extras: np.ndarray, path: Faces, sweep: Sweep, where: np.ndarray, low: tuple,
+        high: tuple, beyond: float, cubic: bool, out: np.ndarray, out_extras: np.ndarray, left: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Carry smoke along a path, near sheets, to cells and to further pieces. Collective."""
         done = np.zeros(len(extras), dtype=bool)
         if self.any:
-            targets = self._in_need(reach, False, path, (courant, low, high), beyond, cubic)
-            sided.carry_cells(
-                self.cut, *targets, reach, three(path), path.parts, self._known, smoke, extras, courant, low, high,
-                beyond, cubic, out, further, done,
-            )  # fmt: skip
-        return self.local.gathered(further, np.flatnonzero(done))
+            for cells, pieces, reach, limit, late in self._turns(
+                sweep, where, False, path, low, high, beyond, cubic, [left]
+            ):
+                sided.carry_cells(
+                    self.cut, cells, pieces, reach, three(path), path.parts, self._known, smoke, extras, sweep.courant,
+                    sweep.long, low, high, beyond, cubic, limit, out, out_extras, done, late[0],
+                )  # fmt: skip
+        out_extras[...] = self.local.gathered(out_extras, np.flatnonzero(done))
 
     # ---- new parts --------------------------------------------------------------------------------------------
 
@@ -276,31 +326,12 @@ class Sheets:
         """Cell array: cells near sheets and those next to them."""
         close = self.near
         for b in range(self.grid.dim):
-            close = _spread(close, b, 1)
+            close = spread(close, b, 1)
         return close
 
     def _without(self, fresh: list[np.ndarray]) -> charts.Cut:
         """Return what kernels read, without some faces."""
         return self.cut._replace(narrow=three([n | f for n, f in zip(self._narrow, fresh, strict=True)]))
-
-
-def beside(cells: np.ndarray, axis: int) -> np.ndarray:
-    """Return which faces of an axis have a marked cell next to them."""
-    faces = np.zeros([n + (b == axis) for b, n in enumerate(cells.shape)], dtype=bool)
-    view, marked = np.moveaxis(faces, axis, 0), np.moveaxis(cells, axis, 0)
-    view[:-1] |= marked
-    view[1:] |= marked
-    return faces
-
-
-def _spread(marked: np.ndarray, axis: int, reach: int) -> np.ndarray:
-    """Return which entries have a marked one within so many along an axis."""
-    view = np.moveaxis(marked, axis, 0)
-    out = view.copy()
-    for shift in range(1, reach + 1):
-        out[shift:] |= view[:-shift]
-        out[:-shift] |= view[shift:]
-    return np.moveaxis(out, 0, axis)
 
 
 def _flat(arrays: list[np.ndarray]) -> np.ndarray:

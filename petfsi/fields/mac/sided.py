@@ -62,8 +62,8 @@ def lead_around(cut, cells, pieces, reach):
 def _limits(low, high, base, w, crossed):
     """Return the ends of the domain in a chart, no farther from a target than the chart is made for."""
     lows = (
-        max(low[0] - base[0], float(w[0] - crossed)), max(low[1] - base[1], float(w[1] - crossed)),
-        max(low[2] - base[2], float(w[2] - crossed)),
+        max(low[0] - base[0], w[0] - crossed - 1.0), max(low[1] - base[1], w[1] - crossed - 1.0),
+        max(low[2] - base[2], w[2] - crossed - 1.0),
     )  # fmt: skip
     highs = (
         min(high[0] - base[0], w[0] + crossed + 1.0), min(high[1] - base[1], w[1] + crossed + 1.0),
@@ -74,8 +74,8 @@ def _limits(low, high, base, w, crossed):
 
 @njit(cache=True)
 def carry_faces(
-    cut, cells, pieces, reach, same, path, path_parts, faces, parts, known, from_below, moved, courant, low,
-    high, cubic, keep, own_faces, out, out_parts, done, kept,
+    cut, cells, pieces, reach, same, path, path_parts, faces, parts, known, from_below, moved, there, courant,
+    long, low, high, cubic, keep, own_faces, limit, out, out_parts, done, left, kept,
 ):  # fmt: skip
     """Carry what is on faces to those of some pieces near sheets, each along its own side.
 
@@ -93,16 +93,22 @@ def carry_faces(
         Velocity of the path and what is carried: three face arrays, and values of links.
     known, from_below : ndarray of bool, shape (n_links,)
         Which of the latter may be read; whether a link sees what its piece below sees.
-    moved, courant, low, high, cubic
+    moved, courant, long, low, high, cubic
         As for ``advect.sweep``; a mask per axis.
+    there : tuple of three ndarray of bool
+        Cell arrays: in which cells faces of each axis are carried.
     keep : bool
         Whether what targets have beyond the values that are read stays with them, see ``advect.keep_own``.
     own_faces : tuple of three ndarray
         What faces have themselves.
+    limit : float
+        As for ``advect.sweep``.
     out, out_parts
         What is carried to plain faces and to links.
     done : ndarray of bool, shape (n_links,)
         Set where that was written.
+    left : tuple of three ndarray of bool
+        Cell arrays, by axis: set where a face comes from farther away than the limit, and nothing was written.
     kept : tuple of three ndarray of bool
         Set where faces were told to keep their own.
     """
@@ -117,7 +123,7 @@ def carry_faces(
     )
     layer = empty_layers(reach, dim)
     every = (np.ones(new[0].shape, np.bool_), np.ones(new[1].shape, np.bool_), np.ones(new[2].shape, np.bool_))
-    some = np.zeros(3, np.bool_)
+    some, far = np.zeros(3, np.bool_), np.zeros(new[0].shape, np.bool_)
     mid = reach + MARGIN
     deep, crossed = mid if dim == 3 else 0, reach - (2 if cubic else 1)
     start = (mid, mid, deep)
@@ -133,7 +139,7 @@ def carry_faces(
             else:
                 q = carried[a]
                 some[a] = complete_faces(cut, a, base, pick, faces[a], parts, known, q, layer[a], todo)
-            if not some[a]:
+            if not some[a] or not there[a][c]:
                 continue
             offset = (0.5 * (a != 0), 0.5 * (a != 1), 0.5 * (a != 2))
             for up in range(2):
@@ -149,9 +155,12 @@ def carry_faces(
                 part = ((w[0], w[0] + 1), (w[1], w[1] + 1), (w[2], w[2] + 1))
                 lows, highs = _limits(low, high, base, w, crossed)
                 sweep(
-                    q, new[a], every[a], flow[0], flow[1], flow[2], offset, part, courant, lows, highs, 0.0, cubic,
-                    False,
+                    q, new[a], every[a], flow[0], flow[1], flow[2], offset, part, courant, long, lows, highs, 0.0,
+                    cubic, False, limit, far,
                 )  # fmt: skip
+                if far[w]:
+                    far[w], left[a][c] = False, True
+                    continue
                 value, first = new[a][w], cut.first[a][f] if divided else 0
                 for link in range(first, cut.ends[first] if divided else 1):
                     if divided:
@@ -177,8 +186,8 @@ def _leads(cut, first, piece, up, from_below):
 
 @njit(cache=True)
 def carry_cells(
-    cut, cells, pieces, reach, path, path_parts, known, smoke, extras, courant, low, high, beyond, cubic, out,
-    out_extras, done,
+    cut, cells, pieces, reach, path, path_parts, known, smoke, extras, courant, long, low, high, beyond, cubic,
+    limit, out, out_extras, done, left,
 ):  # fmt: skip
     """Carry smoke to some pieces near sheets; see ``carry_faces``.
 
@@ -193,7 +202,7 @@ def carry_cells(
     pick, queue = search_room(reach, dim)
     todo = np.empty(2 * pick.size, np.int64)
     flow, q, new = empty_charts(reach, dim), room(reach, dim, 3, 0.0), room(reach, dim, 3, 0.0)
-    layer, every = empty_layers(reach, dim), np.ones(new.shape, np.bool_)
+    layer, every, far = empty_layers(reach, dim), np.ones(new.shape, np.bool_), np.zeros(new.shape, np.bool_)
     mid = reach + MARGIN
     deep, crossed = mid if dim == 3 else 0, reach - (2 if cubic else 1)
     w = (mid, mid, deep)
@@ -204,15 +213,18 @@ def carry_cells(
         reach_pieces(cut, base, w, piece, pick, queue)
         for a in range(dim):
             complete_faces(cut, a, base, pick, path[a], path_parts, known, flow[a], layer[a], todo)
-        _, left = fill_cells(cut, base, pick, smoke, extras, q, layer[3], todo)
-        extend(q, layer[3], dim, False, todo, left)
+        _, unknown = fill_cells(cut, base, pick, smoke, extras, q, layer[3], todo)
+        extend(q, layer[3], dim, False, todo, unknown)
         if not is_inside(cut, base, q.shape):
             clamp_cells(cut, base, pick, smoke, q, layer[3])
         lows, highs = _limits(low, high, base, w, crossed)
         sweep(
-            q, new, every, flow[0], flow[1], flow[2], (0.5, 0.5, 0.5), part, courant, lows, highs, beyond, cubic, True,
+            q, new, every, flow[0], flow[1], flow[2], (0.5, 0.5, 0.5), part, courant, long, lows, highs, beyond,
+            cubic, True, limit, far,
         )  # fmt: skip
-        if piece == 0:
+        if far[w]:
+            far[w], left[c] = False, True
+        elif piece == 0:
             out[c] = new[w]
         else:
             row = cut.extra[c] + piece - 1

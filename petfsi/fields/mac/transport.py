@@ -10,183 +10,17 @@ and v_w is the velocity at the instant where the integrator takes the forces.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
-from petfsi.errors import SolveError
-from petfsi.fields.mac import advect, kinds
+from petfsi.fields.mac import kinds
+from petfsi.fields.mac.advection import Advection
 from petfsi.fields.mac.faces import Faces, each
-from petfsi.fields.mac.grid import MacGrid, three
-from petfsi.fields.mac.sheets import Sheets
-from petfsi.fields.mac.sides import Surroundings
+from petfsi.fields.mac.paths import Path
 from petfsi.integrators import Bdf2, Midpoint, Newmark
-
-#: Cells that the flow may cross in one sweep: with the half cell of staggering and the stencil, all within the ghosts.
-MAX_COURANT = {"linear": 4.0, "cubic": 3.0}
-#: Times that it may cross the whole grid in one step; more is no flow any longer.
-MAX_CROSSINGS = 10
 
 #: Fills ghosts, and faces without a velocity of their own; returns what is to be read of the arrays. Collective.
 Extend = Callable[[Faces], Faces]
-
-
-@dataclass(frozen=True)
-class Path:
-    """A flow that stands still for a time, in sweeps that are short enough.
-
-    Attributes
-    ----------
-    velocity : Faces
-        Ghosts valid.
-    span : float
-        How long it carries, s.
-    sweeps : int
-    crossed : int
-        Cells that no sweep goes beyond.
-    """
-
-    velocity: Faces
-    span: float
-    sweeps: int
-    crossed: int
-
-
-class Advection:
-    """Carries arrays along paths; what differs between the schemes is where and how long.
-
-    Parameters
-    ----------
-    grid : MacGrid
-    surroundings : Surroundings
-        Know what smoke comes in.
-    interpolation : str
-        ``cubic`` or ``linear``.
-
-    Attributes
-    ----------
-    sheets : Sheets or None
-        Carry what lies near sheets; None where nothing cuts cells.
-    """
-
-    def __init__(self, grid: MacGrid, surroundings: Surroundings, interpolation: str) -> None:
-        self.grid, self.surroundings = grid, surroundings
-        self.sheets: Sheets | None = None
-        self.cubic = interpolation == "cubic"
-        self.reach = MAX_COURANT[interpolation]
-        place = list(zip(grid.periodic, grid.ghost, grid.lo, grid.cells, grid.shape(None), strict=True))
-        # a departure point in a ghost cell of another rank or a periodic axis is as good as any
-        self._low = tuple(0.0 if p else float(max(0, g - m)) for p, g, m, _, _ in place)
-        self._high = tuple(float(s) if p else float(min(s, g - m + c)) for p, g, m, c, s in place)
-
-    def path(self, velocity: Faces, span: float) -> Path:
-        """Return the path along a velocity for ``span`` seconds. Collective: one reduction.
-
-        Raises
-        ------
-        SolveError
-            If it crosses the grid so often that it is no flow any longer.
-        """
-        grid = self.grid
-        most = max(advect.largest(v) * span / h for v, h in zip(velocity, grid.dx, strict=True))
-        most = max(most, advect.largest(velocity.parts) * span / float(grid.dx.min()))
-        courant = grid.comm.allreduce(most, op=MPI.MAX)
-        if not courant <= MAX_CROSSINGS * max(grid.cells):
-            raise SolveError(
-                f"the flow has blown up: it would cross {courant:.1e} cells, more than the whole grid "
-                f"{MAX_CROSSINGS} times, in one step of {span:g} s. Take a smaller dt, or look at what drives it."
-            )
-        sweeps = max(1, int(np.ceil(courant / self.reach)))
-        return Path(velocity, span, sweeps, max(1, int(np.ceil(courant / sweeps))))
-
-    def carry_faces(
-        self, q: Faces, path: Path, moved: list[np.ndarray], out: Faces, own: Faces | None = None
-    ) -> list[np.ndarray] | None:
-        """Carry what is on faces into the owned part of ``out``. Collective.
-
-        Parameters
-        ----------
-        q : Faces
-            Ghosts valid.
-        path : Path
-        moved : list of ndarray of bool
-            Where; elsewhere ``out`` is q.
-        out : Faces
-        own : Faces, optional
-            What faces have themselves, which those near sheets are to keep as ``keep_own`` says.
-
-        Returns
-        -------
-        list of ndarray of bool or None
-            Which faces did; None where there are no sheets.
-        """
-        kept = None
-        if path.sweeps > 1:
-            own = None  # it has all flowed on
-        for left in reversed(range(path.sweeps)):
-            target = Faces(np.empty_like(v) for v in q) if left else out
-            for axis, v in enumerate(q):
-                self._sweep(v, path, moved[axis], axis, 0.0, target[axis])
-            if self.sheets is not None:
-                kept = self.sheets.carry_faces(q, path.velocity, moved, *self._limits(path), self.cubic, own, target)
-            if left:
-                for axis, v in enumerate(target):
-                    self.grid.exchange_faces(axis, v)
-                    self.grid.fill_sides(v, axis)
-                q = target
-        return kept
-
-    def carry_smoke(
-        self, smoke: np.ndarray, extras: np.ndarray, path: Path, moved: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return smoke carried to the owned cells and to the further pieces of divided ones. Collective.
-
-        Parameters
-        ----------
-        smoke, extras : ndarray
-            Cell array, ghosts valid, and values of further pieces.
-        path : Path
-        moved : ndarray of bool
-            Where; elsewhere smoke stays.
-        """
-        # it comes in from behind the sides, where the ghosts know what a jet carries
-        beyond = 0.5
-        for left in reversed(range(path.sweeps)):
-            target = np.empty_like(smoke)
-            self._sweep(smoke, path, moved, None, beyond, target)
-            if self.sheets is not None:
-                extras = self.sheets.carry_smoke(
-                    smoke, extras, path.velocity, *self._limits(path), beyond, self.cubic, target
-                )
-            if left:
-                self.grid.exchange_cells(target)
-                self.surroundings.fill_smoke(target)
-            smoke = target
-        return smoke, extras
-
-    def _limits(self, path: Path) -> tuple[tuple, int, tuple, tuple]:
-        """Return how a sweep goes: dt / dx, how many cells away it may read, and the ends of the domain."""
-        courant = (*(path.span / path.sweeps / self.grid.dx), 0.0)[:3]
-        return courant, path.crossed + (2 if self.cubic else 1), self._low, self._high
-
-    def _sweep(
-        self, q: np.ndarray, path: Path, moved: np.ndarray, axis: int | None, beyond: float, out: np.ndarray
-    ) -> None:
-        """Carry the faces of an axis (cells: None) for one sweep as if nothing divided them."""
-        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
-        part = tuple((s.start, s.stop) for s in self.grid.owned(axis))
-        courant, _, low, high = self._limits(path)
-        bounded = axis is None
-        advect.sweep(
-            q, out, moved, *three(path.velocity), offset, part, courant, low, high, beyond, self.cubic, bounded
-        )  # fmt: skip
-
-    def keep_own(self, own: np.ndarray, read: np.ndarray, path: Path, axis: int, out: np.ndarray) -> None:
-        """Add to faces carried from ``read`` what they have beyond it, as far as it has not flowed on."""
-        offset = tuple(0.0 if b == axis else 0.5 for b in range(3))
-        part = tuple((s.start, s.stop) for s in self.grid.owned(axis))
-        advect.keep_own(out, own, read, *three(path.velocity), offset, part, (*(path.span / self.grid.dx), 0.0)[:3])
 
 
 class Transport:
@@ -381,7 +215,7 @@ class MidpointTransport(Transport):
             self._read = extend(each(np.copy, own)) if self.past_dt else own
         kept = self.advection.carry_faces(self._read, path, moved, star, own)
         for axis, v in enumerate(self._read):
-            read = v if kept is None else np.where(kept[axis], own[axis], v)
+            read = np.where(kept[axis], own[axis], v)
             self.advection.keep_own(own[axis], read, path, axis, star[axis])
         self._start = each(np.copy, star)
 
