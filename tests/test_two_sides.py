@@ -1,5 +1,6 @@
 """Both sides of sheets thinner than a cell: water of its own on each, at rest or moving, on any number of ranks."""
 
+import meshio
 import numpy as np
 import pytest
 from mac_cases import reader, whole_state
@@ -392,3 +393,49 @@ def test_a_flow_too_fast_for_one_sweep_stays_on_its_side_of_a_sheet(integrator):
         gone = speed * (x[1] - height) / (1 - height) * sim.time
         assert np.abs(smoke - 1 - np.sin(2 * np.pi * (x[0] - gone)))[above].max(initial=0.0) < 0.06
         assert np.abs(smoke[x[1] < height - 0.5 / N]).max(initial=0.0) == 0.0
+
+
+#: Walls nearly along the grid, about a cell thick: cells, size, slope and thickness in cells of a wall, its direction,
+#: scheme, step, cells that it goes in a step, and where it begins, in parts of the box.
+THIN_WALLS = [
+    ((17, 24), (0.892, 0.9034), 0.1311, 1.4666, 3.4843, "newmark", 0.01236, 0.3951, (0.589451, 0.470758)),
+    ((23, 20), (0.8914, 0.8514), 0.1096, 1.0057, 4.1775, "bdf2", 0.03559, 0.5126, (0.418287, 0.520205)),
+    ((14, 17), (0.6737, 0.6736), 1.7001, 0.7477, 1.4116, "midpoint", 0.02686, 0.5427, (0.504881, 0.456123)),
+    ((18, 16), (0.8007, 0.7658), 0.0366, 1.0155, 3.0809, "midpoint", 0.01071, 0.5167, (0.411763, 0.571253)),
+]
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("cells, size, angle, thick, heading, integrator, dt, stride, at", THIN_WALLS)
+def test_thin_slanting_walls_that_move_keep_water_apart_that_goes_along_one_side(
+    cells, size, angle, thick, heading, integrator, dt, stride, at, tmp_path
+):
+    """All is uniform on either side. Cells that hold one side's water become the other's, and parts of sides, too."""
+    h = min(np.divide(size, cells))
+    normal, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    middle, speed = np.multiply(size, at), stride * h / dt * np.array([np.cos(heading), np.sin(heading)])
+    slide = 0.8 * h / dt * along
+    reach = np.linspace(-1.5, 1.5, 25)[:, None] * max(size) * along
+    points = np.concatenate([middle + reach + side * thick * h / 2 * normal for side in (1, -1)])
+    k = np.arange(24)
+    halves = np.stack(((k, k + 1, k + 26), (k, k + 26, k + 25)), axis=0).transpose(0, 2, 1).reshape(-1, 3)
+    mesh = tmp_path / "wall.vtk"
+    meshio.write_points_cells(mesh, np.column_stack((points, np.zeros(50))), [("triangle", halves)])
+    held = [{"where": "all", "fix": ["x", "y"], "velocity": dict(zip("xy", speed, strict=True))}]
+    body = {"shape": {"mesh": str(mesh)}, "supports": held, "young": 1e6, "poisson": 0.3, "density": RHO}
+    right = f"where({normal[0]}*(x-{middle[0]})+{normal[1]}*(y-{middle[1]})>0,1,0)"
+    fluid = {"density": RHO, "origin": [0.0, 0.0], "size": size, "cells": cells, "smoke": {"initial": right}}
+    fluid |= {"sides": dict.fromkeys(("left", "right", "bottom", "top"), "open")}
+    fluid |= {"initial": {"velocity": [f"{v}+{s}*{right}" for v, s in zip(speed, slide, strict=True)]}}
+    time = {"end": 10.0, "dt": dt, "integrator": integrator}
+    scene = Scene.model_validate({"dim": 2, "time": time, "fluid": fluid, "solids": {"body": body}})
+    with simulation(MPI.COMM_WORLD, scene, "monolithic.opts") as sim:
+        for _ in range(12):
+            sim.advance()
+            far = (thick / 2 + 0.72 + stride) * h  # where the grid is cut is a step behind
+            for array, axis in ((sim.fluid.smoke, None), (sim.fluid.velocity[0], 0), (sim.fluid.velocity[1], 1)):
+                value, x = own_part(sim.fluid, array, axis)
+                aside = sum((x[b] - middle[b] - speed[b] * sim.time) * normal[b] for b in range(2))
+                low, step = (0.0, 1.0) if axis is None else (speed[axis], slide[axis])
+                assert np.abs(value - low)[aside < -far].max(initial=0.0) < 1e-9
+                assert np.abs(value - low - step)[aside > far].max(initial=0.0) < 1e-9

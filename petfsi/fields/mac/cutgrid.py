@@ -103,8 +103,6 @@ class CutGrid:
         own = np.zeros(grid.shape(None), dtype=bool)
         own[grid.owned(None)] = True
         self._own = own.reshape(-1)[self._flat]  # a ghost may stand for a cell of this rank: only that one counts
-        #: Whether any cell was divided when the grid was last cut: then walls say what became of its pieces.
-        self.had_parts = False
         self._covered = np.zeros(grid.shape(None), dtype=bool)
         static = self.cut(np.zeros((0, dim)), np.zeros((0, dim), dtype=np.int64))
         self._covered = static.cell_kind == kinds.SOLID
@@ -260,12 +258,9 @@ class CutGrid:
     ) -> tuple[Layout, np.ndarray, Extras | None, Parts, np.ndarray]:
         """Return layout, cell numbers, extras, parts, and the global number of each slot. Collective."""
         grid = self.grid
-        had_parts, self.had_parts = self.had_parts, True
         if not grid.comm.allreduce(bool(len(found.extra_cell) or links.split.any()), op=MPI.LOR):
-            self.had_parts = False
-            parts = Parts.none()
-            if had_parts:
-                parts = Parts.gathered(grid, np.zeros((0, 3)), np.zeros((0, 5)), self._wall_areas(found))
+            # walls say what becomes of pieces: of all cells, because a whole one may be divided when it is cut next
+            parts = Parts.gathered(grid, np.zeros((0, 3)), np.zeros((0, 5)), self._wall_areas(found))
             return grid.layout, grid.index, None, parts, grid.index.reshape(-1)[self._flat]
         local = self._flat[found.extra_cell]
         mine = np.flatnonzero(self._own[found.extra_cell])

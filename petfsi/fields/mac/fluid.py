@@ -151,7 +151,7 @@ class MacFluid(CoveredGrid):
         self._mark_uncovered(old, self.sheets, old_kind, other)
         if len(parts) or len(old.table):
             self._go_on(Lineage(grid, old, self.sheets, old_kind))
-        if self.sheets.anywhere:
+        if old.anywhere or self.sheets.anywhere:
             self._renew(self.sheets)
 
     def _mark_uncovered(self, old: Sheets, new: Sheets, old_kind: list[np.ndarray], other: np.ndarray) -> None:
@@ -501,8 +501,6 @@ class MacFluid(CoveredGrid):
         """Take back divided cells and faces, and what is on them; kinds are back already. Collective."""
         self.sheets = self._sheets_of(Parts.restored(read))
         self._transport.advection.sheets = self.sheets
-        assert self._cutter is not None
-        self._cutter.had_parts = len(self.sheets.table) > 0
         stored = {name: read_whole(read, f"parts_{name}") for name in self._on_parts()}
         self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
         self._transport.carried.parts = self.velocity.parts

@@ -40,7 +40,7 @@ class Lineage:
         self.grid, self.old, self.new = grid, old, new
         before, after = old.table, new.table
         cells, first, piece, guessed = _matched(grid, before, after)
-        self._source = _links(grid, before, after, cells, first, piece)
+        self._source = _links(grid, before, after, cells, first, piece, self._flipped())
         self._known = self._with_kinds(old_kind)
         self._plain = self._healed(cells, first, piece)
         row = before.first_piece(after.cell)
@@ -51,6 +51,12 @@ class Lineage:
         self._lost = cells[zero == LOST]
         self._guessed = cells[guessed & (np.diff(first) > 1)]
 
+    def _flipped(self) -> np.ndarray:
+        """Return the cells that are divided neither now nor before, but hold other water now. Collective."""
+        grid, part = self.grid, self.grid.owned(None)
+        place = np.argwhere(self.new.flipped[part]) + grid.lo
+        return np.concatenate(grid.comm.allgather(np.ravel_multi_index(tuple(place.T), grid.cells)))
+
     def _with_kinds(self, old_kind: list[np.ndarray]) -> np.ndarray:
         """Return which links go on as something, of whole faces those alone that had a velocity. Collective."""
         local = self.new.local
@@ -59,7 +65,10 @@ class Lineage:
         return local.gathered(known, local.link) > 0.0
 
     def _healed(self, cells: np.ndarray, first: np.ndarray, piece: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return by axis the local faces that are no longer divided, and the old links whose values they take."""
+        """Return by axis the local faces that are no longer divided, and the old links whose values they take.
+
+        Where none of those was of the face's own water, this side's surroundings say: it is as if just uncovered.
+        """
         before, found = self.old.table, []
         begin = before.first[:-1]
         below, above = (
@@ -68,9 +77,11 @@ class Lineage:
         )
         best = _widest(before.first, before.below, before.above, before.openness, below, above)
         gone = self.new.table.rows_of_faces(before.axis[begin], before.face[begin]) < 0
-        for flat, which in self.old.local.faces:
+        for a, (flat, which) in enumerate(self.old.local.faces):
             use = gone[which]
-            found.append((flat[use], best[which[use]]))
+            flat, link = flat[use], best[which[use]]
+            self.new.uncover(a, flat[link < 0])
+            found.append((flat, np.where(link < 0, begin[which[use]], link)))
         return found
 
     def faces(self, quantity: Faces) -> Faces:
@@ -213,12 +224,14 @@ def _went_on(
 
 
 def _links(
-    grid: MacGrid, before: Parts, after: Parts, cells: np.ndarray, first: np.ndarray, match: np.ndarray
-) -> np.ndarray:
+    grid: MacGrid, before: Parts, after: Parts, cells: np.ndarray, first: np.ndarray, match: np.ndarray,
+    flipped: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Return the old link that each new one goes on as, WHOLE or LOST."""
+    beside = [cells_beside(grid, after, side) for side in (True, False)]
     below, above = (
-        _went_on(piece, cells_beside(grid, after, side), cells, first, match)
-        for side, piece in ((True, after.below), (False, after.above))
+        np.where((piece >= 0) & np.isin(cell, flipped), LOST, _went_on(piece, cell, cells, first, match))
+        for piece, cell in zip((after.below, after.above), beside, strict=True)
     )
     row = before.rows_of_faces(after.axis, after.face)
     alone = np.repeat(np.diff(after.first) == 1, np.diff(after.first))
@@ -254,12 +267,13 @@ def _closest(begin, end, old_below, old_above, openness, below, above):
 
 @njit(cache=True)
 def _widest(first, below, above, openness, want_below, want_above):
-    """Return for each divided face the link that it takes after, given old pieces of its cells, if it is no more."""
+    """Return for each divided face the link that it takes after if it is no more, given old pieces of its cells.
+
+    LOST where there is none.
+    """
     best = np.empty(len(first) - 1, np.int64)
     for face in range(len(best)):
         best[face] = _closest(first[face], first[face + 1], below, above, openness, want_below[face], want_above[face])
-        if best[face] < 0:
-            best[face] = first[face]
     return best
 
 

@@ -329,6 +329,12 @@ class Sheets:
             close = spread(close, b, 1)
         return close
 
+    def uncover(self, axis: int, faces: np.ndarray) -> None:
+        """Mark local faces, by flat index, whose values were those of other water: none may be read from there."""
+        kind = self._kind[axis].reshape(-1)[faces]
+        open_ones = (kind == kinds.PRESSURE) | (kind == kinds.OPEN)
+        self.fresh[axis].reshape(-1)[faces[open_ones]] = True
+
     def _without(self, fresh: list[np.ndarray]) -> charts.Cut:
         """Return what kernels read, without some faces."""
         return self.cut._replace(narrow=three([n | f for n, f in zip(self._narrow, fresh, strict=True)]))
