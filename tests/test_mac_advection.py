@@ -254,3 +254,21 @@ def test_what_is_too_fast_for_one_sweep_goes_as_if_all_went_in_several(dim, shee
         share = fluid.comm.allreduce(float(fast.sum())) / fluid.comm.allreduce(float(fast.size))
         assert 0.01 < share < 0.5
         assert np.abs(one - other)[fast].max(initial=0.0) < 1e-14
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize("crossed", [3.0, 4.0, 6.0, 12.0, 24.0])
+def test_a_blob_of_smoke_goes_whole_cells_however_many_in_a_step(crossed, interpolation):
+    """Also where it leaves all that a sweep reads, and where the last digits of the speed say a bit more."""
+    n = 36
+    blob = "where((abs(x-0.2)<0.08)*(abs(y-0.5)<0.1),1,0)"
+    for speed in (1.0, 1.0 + 5e-16, 1.0 - 5e-16):
+        fluid = smoke_fluid((n, n), blob, sides=PERIODIC, advection=interpolation)
+        set_velocity(fluid, [lambda x, y, z, s=speed: s, lambda x, y, z: 0.0])
+        before = smoke(fluid)
+        fluid.predict(0.0, crossed / n)
+        sweeps = np.ceil(crossed / (4.0 if interpolation == "linear" else 3.0) - 1e-9)
+        if crossed % sweeps == 0:
+            assert np.abs(smoke(fluid) - np.roll(before, int(crossed), axis=0)).max() < 1e-12
+        assert smoke(fluid).sum() == pytest.approx(before.sum(), rel=1e-12)

@@ -123,31 +123,36 @@ class Advection:
         beyond = 0.5
         out, out_extras = smoke.copy(), extras.copy()
         left = np.zeros(grid.shape(None), dtype=bool)
-        self._sweep_smoke(smoke, extras, path, path.whole, moved, beyond, out, out_extras, left)
+        some = self._reached(smoke, extras, path)
+        self._sweep_smoke(smoke, extras, path, path.whole, moved, some, beyond, out, out_extras, left)
         for (where,), last in self._rest(path, [left], [None], beyond):
             target, further = (out, out_extras) if last else (smoke.copy(), extras.copy())
-            there = moved & where
-            self._sweep_smoke(smoke, extras, path, path.short, there, beyond, target, further, left, where)
+            self._sweep_smoke(smoke, extras, path, path.short, moved, some & where, beyond, target, further, left)
             if not last:
                 grid.exchange_cells(target)
                 self.surroundings.fill_smoke(target)
                 smoke, extras = target, further
         return out, out_extras
 
-    def _sweep_smoke(
-        self, smoke: np.ndarray, extras: np.ndarray, path: Path, sweep: Sweep, moved: np.ndarray, beyond: float,
-        out: np.ndarray, further: np.ndarray, left: np.ndarray, where: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
-        """Carry the smoke of cells for one sweep; see ``_sweep_faces``. Collective."""
+    def _reached(self, smoke: np.ndarray, extras: np.ndarray, path: Path) -> np.ndarray:
+        """Return the cells to which smoke may come along a path: elsewhere it stays zero. Collective."""
         some = smoke != 0.0
         if self.sheets is not None:
             some |= self.sheets.holds(extras)
-        for axis in range(self.grid.dim):
-            some = spread(some, axis, sweep.reach)
-        # where there is none around, none comes
-        self._sweep(smoke, path, sweep, moved & some, None, beyond, out, left)
+        for n in range(path.sweeps):
+            if n > 0:
+                self._complete(some)
+            for axis in range(self.grid.dim):
+                some = spread(some, axis, path.whole.reach)
+        return some
+
+    def _sweep_smoke(
+        self, smoke: np.ndarray, extras: np.ndarray, path: Path, sweep: Sweep, moved: np.ndarray, where: np.ndarray,
+        beyond: float, out: np.ndarray, further: np.ndarray, left: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Carry the smoke of cells for one sweep, ``where`` it is said; mark those that are left. Collective."""
+        self._sweep(smoke, path, sweep, moved & where, None, beyond, out, left)
         if self.sheets is not None:
-            where = some if where is None else some & where
             self.sheets.carry_smoke(
                 smoke, extras, path.velocity, sweep, where, *self._ends, beyond, self.cubic, out, further, left
             )  # fmt: skip

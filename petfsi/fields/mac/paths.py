@@ -20,6 +20,8 @@ from petfsi.fields.mac.grid import MacGrid
 MAX_COURANT = {"linear": 4.0, "cubic": 3.0}
 #: Entries on either side of a point that are read.
 STENCIL = {"linear": 1, "cubic": 2}
+#: A flow that crosses just so many cells goes in one sweep, however the last digits are rounded.
+SLACK = 1e-9
 #: Times that the flow may cross the whole grid in one step; more is no flow any longer.
 MAX_CROSSINGS = 10
 
@@ -99,10 +101,11 @@ def find_path(grid: MacGrid, velocity: Faces, fastest: list[np.ndarray], span: f
             f"{MAX_CROSSINGS} times, in one step of {span:g} s. Take a smaller dt, or look at what drives it."
         )
     farthest, stencil = MAX_COURANT[interpolation], STENCIL[interpolation]
-    sweeps = max(1, int(np.ceil(courant / farthest)))
+    sweeps = max(1, int(np.ceil(courant / farthest - SLACK)))
 
-    short = Sweep((*(span / sweeps / grid.dx), 0.0)[:3], False, max(1, int(np.ceil(courant / sweeps))) + stencil)
+    reach = max(1, int(np.ceil(courant / sweeps - SLACK))) + stencil
+    short = Sweep((*(span / sweeps / grid.dx), 0.0)[:3], False, reach)
     whole = short
     if sweeps > 1:
-        whole = Sweep((*(span / grid.dx), 0.0)[:3], True, int(farthest) + stencil, farthest)
+        whole = Sweep((*(span / grid.dx), 0.0)[:3], True, int(farthest) + stencil, farthest + SLACK)
     return Path(velocity, span, whole, sweeps, short)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -129,37 +128,20 @@ class Sheets:
         odd = thin.odd_cells(self._kind, self._narrow, self.divided, self._fluid, self._low, self._high)
         return thin.count_before(odd), thin.count_before(self.near)
 
-    def _turns(
+    def _in_need(
         self, sweep: Sweep, where: np.ndarray, faces: bool, path: Faces, low: tuple, high: tuple, beyond: float,
-        cubic: bool, left: list[np.ndarray],
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, int, float, list[np.ndarray]]]:  # fmt: skip
-        """Yield those of some cells whose paths meet sheets, see ``thin``, in turns by how far they go.
-
-        Cells, one piece of each, cells that charts reach, the limit to how far they may go, and where to mark those
-        that go farther along their own side: they have another turn, or in the end are ``left``.
-        """
+        cubic: bool,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Return those of some cells whose paths meet sheets, each with one of its pieces, see ``thin``."""
         cells, pieces = self._pieces(sweep.reach)
         there = where[tuple(cells.T)]
         cells, pieces = cells[there], pieces[there]
         divided, (odd, near) = self.divided[tuple(cells.T)], self._counts
-        far = thin.in_need(
+        need = thin.in_need(
             odd, near, cells, divided, faces, self._high, three(path), sweep.courant, sweep.long, low, high, beyond,
             cubic, self.grid.dim,
         )  # fmt: skip
-        need = far >= 0.0
-        cells, pieces = cells[need], pieces[need]
-        stencil = 2 if cubic else 1
-        last = sweep.reach - stencil
-        turn = np.clip(np.ceil(far[need]), 1, last)
-        for n in range(1, last + 1):
-            now = turn == n
-            if not now.any():
-                continue
-            late = left if n == last else [np.zeros_like(mask) for mask in left]
-            yield cells[now], pieces[now], n + stencil, sweep.limit if n == last else float(n), late
-            if n < last:
-                place = tuple(cells.T)
-                turn[now & np.logical_or.reduce([mask[place] for mask in late])] = n + 1
+        return cells[need], pieces[need]
 
     # ---- transport --------------------------------------------------------------------------------------------
 
@@ -185,15 +167,15 @@ class Sheets:
         """
         done = np.zeros(len(self.table), dtype=bool)
         if self.any:
-            own_faces = three(faces if own is None else own)
             masks = [np.ones(self._fluid.shape, dtype=bool)] * len(left) if where is None else where
             some = np.logical_or.reduce(masks)
-            for cells, pieces, reach, limit, late in self._turns(sweep, some, True, path, low, high, 0.0, cubic, left):
-                sided.carry_faces(
-                    self.cut, cells, pieces, reach, faces is path, three(path), path.parts, three(faces), faces.parts,
-                    self._known, self.from_below, three(moved), three(masks), sweep.courant, sweep.long, low, high,
-                    cubic, own is not None, own_faces, limit, three(out), out.parts, done, three(late), three(kept),
-                )  # fmt: skip
+            targets = self._in_need(sweep, some, True, path, low, high, 0.0, cubic)
+            sided.carry_faces(
+                self.cut, *targets, sweep.reach, faces is path, three(path), path.parts, three(faces), faces.parts,
+                self._known, self.from_below, three(moved), three(masks), sweep.courant, sweep.long, low, high, cubic,
+                own is not None, three(faces if own is None else own), sweep.limit, three(out), out.parts, done,
+                three(left), three(kept),
+            )  # fmt: skip
         out.parts = self.local.gathered(out.parts, np.flatnonzero(done))
         self.local.mean_into(out, out.parts)
 
@@ -204,13 +186,11 @@ class Sheets:
         """Carry smoke along a path, near sheets, to cells and to further pieces. Collective."""
         done = np.zeros(len(extras), dtype=bool)
         if self.any:
-            for cells, pieces, reach, limit, late in self._turns(
-                sweep, where, False, path, low, high, beyond, cubic, [left]
-            ):
-                sided.carry_cells(
-                    self.cut, cells, pieces, reach, three(path), path.parts, self._known, smoke, extras, sweep.courant,
-                    sweep.long, low, high, beyond, cubic, limit, out, out_extras, done, late[0],
-                )  # fmt: skip
+            targets = self._in_need(sweep, where, False, path, low, high, beyond, cubic)
+            sided.carry_cells(
+                self.cut, *targets, sweep.reach, three(path), path.parts, self._known, smoke, extras, sweep.courant,
+                sweep.long, low, high, beyond, cubic, sweep.limit, out, out_extras, done, left,
+            )  # fmt: skip
         out_extras[...] = self.local.gathered(out_extras, np.flatnonzero(done))
 
     # ---- new parts --------------------------------------------------------------------------------------------

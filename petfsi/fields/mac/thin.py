@@ -134,7 +134,7 @@ def _any(before, begin, end):
 
 @njit(cache=True)
 def in_need(odd, near, cells, divided, faces, high_cell, path, courant, long, low, high, beyond, cubic, dim):
-    """Return how far cells' paths, as the grid has them, go where they read what may be of another side of a sheet.
+    """Return which cells' paths, as the grid has them, read what may be of the other side of a sheet.
 
     A path that reads whole cells of open water alone, all joined with each other, or no wall that is thin, needs no
     more than the grid. Of a thin wall that it reads, the cell beside it on its own side is among those, or next to one.
@@ -158,17 +158,15 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, long, lo
 
     Returns
     -------
-    ndarray, shape (n,)
-        Cells that any of a cell's paths crosses along an axis; -1 where none reads such.
+    ndarray of bool, shape (n,)
     """
-    far = np.full(len(cells), -1.0)
+    need = np.zeros(len(cells), np.bool_)
     flat, wide = dim == 2, 2 if cubic else 1
     begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
     for n in range(len(cells)):
         c = (cells[n, 0], cells[n, 1], cells[n, 2])
         begin[0], begin[1], begin[2] = c
         end[0], end[1], end[2] = c[0] + 1, c[1] + 1, c[2] + 1
-        farthest = 0.0
         for a in range(dim if faces else 1):
             for up in range(2 if faces and c[a] == high_cell[a] - 1 else 1):
                 f = (c[0] + up * (a == 0), c[1] + up * (a == 1), c[2] + up * (a == 2))
@@ -179,8 +177,6 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, long, lo
                     path[0], path[1], path[2], f[0], f[1], f[2], offset, courant, long, low, high, beyond, flat
                 )  # fmt: skip
                 for b in range(dim):
-                    at = f[b] + offset[b]
-                    farthest = max(farthest, at - least[b], most[b] - at)
                     first = min(int(least[b]) - 1, int(np.floor(d[b])) - wide)
                     last = max(int(most[b]) + 1, int(np.floor(d[b])) + wide)
                     begin[b], end[b] = min(begin[b], first), max(end[b], last + 1)
@@ -190,6 +186,5 @@ def in_need(odd, near, cells, divided, faces, high_cell, path, courant, long, lo
             continue
         for b in range(dim):
             begin[b], end[b] = max(begin[b] - 1, 0), min(end[b] + 1, odd.shape[b] - 1)
-        if divided[n] or _any(near, begin, end):
-            far[n] = farthest
-    return far
+        need[n] = divided[n] or _any(near, begin, end)
+    return need
