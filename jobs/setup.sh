@@ -47,4 +47,13 @@ PY
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
     echo "$wanted" > "$stamp"
 fi
+
+# Numba looks at a compiled function's own file alone: where a function that it calls has changed, it would go on with
+# the old one.
+kernels="$site/.petfsi-kernels"
+now=$(grep -rl --include='*.py' njit petfsi | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
+if [ "$(cat "$kernels" 2>/dev/null || true)" != "$now" ]; then
+    find petfsi -name '*.nb[ci]' -delete
+    echo "$now" > "$kernels"
+fi
 echo "setup: ready ($(.venv/bin/petfsi --version))"

@@ -18,7 +18,6 @@ from petfsi.petsc import IntType, new_block, set_csr
 #: More nodes than this are solved for with multigrid.
 MANY = 20_000
 PREFIX = "turning_"
-_ALONE = {"ksp_type": "preonly", "pc_type": "cholesky"}
 _SMALL = {"ksp_type": "cg", "ksp_rtol": "1e-14", "ksp_max_it": "5000", "pc_type": "jacobi"}
 _LARGE = {"ksp_type": "cg", "ksp_rtol": "1e-10", "ksp_max_it": "200", "pc_type": "gamg"}
 
@@ -165,8 +164,7 @@ class _Laplace:
         self._ksp.setOptionsPrefix(PREFIX)
         self._ksp.setOperators(self._matrix)
         options = PETSc.Options(PREFIX)
-        small = _ALONE if comm.size == 1 else _SMALL
-        chosen = small if mesh.nodes.n_global <= MANY else _LARGE
+        chosen = _SMALL if mesh.nodes.n_global <= MANY else _LARGE
         for name, value in chosen.items():
             options.setValue(name, value)
         self._ksp.setFromOptions()
