@@ -187,7 +187,9 @@ def test_state_comes_back_bit_for_bit(integrator):
     assert any(name.startswith("euler-bernoulli_") for name in want)
     assert want.keys() == got.keys()
     for name, values in want.items():
-        np.testing.assert_array_equal(got[name], values, err_msg=name)
+        # on several ranks MUMPS adds up what comes in, in the order in which it comes
+        atol = 0.0 if sim.comm.size == 1 else 1e-14 * np.abs(values).max(initial=0.0)
+        np.testing.assert_allclose(got[name], values, rtol=0.0, atol=atol, err_msg=name)
 
 
 # ---- in a fluid ---------------------------------------------------------------------------------------------
