@@ -20,6 +20,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from petfsi.fields.mac.rows import sum_of_rows
+
 
 @njit(cache=True, inline="always")
 def _clamp(s, low, high):
@@ -65,22 +67,6 @@ def _weights(f):
 
 
 @njit(cache=True, inline="always")
-def _row(q, i, j, k, c0, c1, c2, c3):
-    """Return the sum of four values along the last axis, from k on, with the given weights."""
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    return c0 * q[i, j, k] + c1 * q[i, j, k + one] + c2 * q[i, j, k + two] + c3 * q[i, j, k + three]
-
-
-@njit(cache=True, inline="always")
-def _plane(q, i, j, k, b0, b1, b2, b3, c0, c1, c2, c3):
-    """Return the sum of sixteen values across the first axis, from j and k on."""
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    low = b0 * _row(q, i, j, k, c0, c1, c2, c3) + b1 * _row(q, i, j + one, k, c0, c1, c2, c3)
-    high = b2 * _row(q, i, j + two, k, c0, c1, c2, c3) + b3 * _row(q, i, j + three, k, c0, c1, c2, c3)
-    return low + high
-
-
-@njit(cache=True, inline="always")
 def _line(q, i, j, b0, b1, b2, b3):
     """Return the sum of four values along the second axis of a plane grid, from j on."""
     k = np.uint64(0)
@@ -104,13 +90,7 @@ def _cubic(q, s0, s1, s2, flat):
         return low + high
     s2 = _clamp(s2, 0.0, n2 - 1.0)
     k0 = max(min(int(s2), n2 - 3), 1)
-    c0, c1, c2, c3 = _weights(s2 - k0)
-    k = np.uint64(k0 - 1)
-    low = a0 * _plane(q, i, j, k, b0, b1, b2, b3, c0, c1, c2, c3)
-    low += a1 * _plane(q, i + one, j, k, b0, b1, b2, b3, c0, c1, c2, c3)
-    high = a2 * _plane(q, i + two, j, k, b0, b1, b2, b3, c0, c1, c2, c3)
-    high += a3 * _plane(q, i + three, j, k, b0, b1, b2, b3, c0, c1, c2, c3)
-    return low + high
+    return sum_of_rows(q, i0 - 1, j0 - 1, k0 - 1, (a0, a1, a2, a3), (b0, b1, b2, b3), _weights(s2 - k0))
 
 
 @njit(cache=True)
