@@ -439,3 +439,48 @@ def test_thin_slanting_walls_that_move_keep_water_apart_that_goes_along_one_side
                 low, step = (0.0, 1.0) if axis is None else (speed[axis], slide[axis])
                 assert np.abs(value - low)[aside < -far].max(initial=0.0) < 1e-9
                 assert np.abs(value - low - step)[aside > far].max(initial=0.0) < 1e-9
+
+
+def slab(middle, normal, thick, n=6, length=3.2):
+    """Return points and tetrahedra of a square plate about a point, across a direction."""
+    u, v = np.linalg.svd(normal[None])[2][1:]
+    a, b = np.meshgrid(*[np.linspace(-length / 2, length / 2, n + 1)] * 2, indexing="ij")
+    layer = middle + a.reshape(-1, 1) * u + b.reshape(-1, 1) * v
+    points = np.concatenate([layer + side * thick / 2 * normal for side in (-1, 1)])
+    i, j = np.mgrid[:n, :n].reshape(2, -1)
+    corner = [s * (n + 1) ** 2 + (i + p) * (n + 1) + j + q for s in (0, 1) for p in (0, 1) for q in (0, 1)]
+    paths = [(0, 1, 3, 7), (0, 5, 1, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 6, 4, 7)]
+    cells = np.concatenate([np.stack([corner[c] for c in path], axis=1) for path in paths])
+    edges = points[cells[:, 1:]] - points[cells[:, :1]]
+    mirrored = np.linalg.det(edges) < 0
+    cells[mirrored] = cells[mirrored][:, [0, 2, 1, 3]]
+    return points, cells
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
+def test_a_thin_slanting_wall_that_moves_in_space_keeps_water_apart(integrator, tmp_path):
+    """Faces that are mere slits between two steps, and open wide after the next cut, are of their own side's water."""
+    n, h, dt = 12, 1.0 / 12, 0.02
+    normal = np.array([0.068, 0.047, 0.997])
+    normal /= np.linalg.norm(normal)
+    middle, speed = np.array([0.47, 0.52, 0.55]), h / dt * np.array([0.13, -0.19, -0.16])
+    slide = 0.6 * h / dt * np.cross(normal, [0.08, -0.28, 0.0]) / 0.29
+    points, cells = slab(middle, normal, 1.76 * h)
+    mesh = tmp_path / "wall.vtk"
+    meshio.write_points_cells(mesh, points, [("tetra", cells)])
+    held = [{"where": "all", "fix": ["x", "y", "z"], "velocity": dict(zip("xyz", speed, strict=True))}]
+    body = {"shape": {"mesh": str(mesh)}, "supports": held, "young": 1e6, "poisson": 0.3, "density": RHO}
+    above = "+".join(f"{c}*({x}-{m})" for c, x, m in zip(normal, "xyz", middle, strict=True))
+    fluid = {"density": RHO, "origin": [0.0] * 3, "size": [1.0] * 3, "cells": [n] * 3}
+    fluid |= {"sides": dict.fromkeys(("left", "right", "bottom", "top", "back", "front"), "open")}
+    fluid |= {"initial": {"velocity": [f"{v}+{s}*where({above}>0,1,0)" for v, s in zip(speed, slide, strict=True)]}}
+    time = {"end": 10.0, "dt": dt, "integrator": integrator}
+    scene = Scene.model_validate({"dim": 3, "time": time, "fluid": fluid, "solids": {"body": body}})
+    with simulation(MPI.COMM_SELF, scene, "monolithic.opts") as sim:
+        for _ in range(6):
+            sim.advance()
+            for axis, value in enumerate(sim.fluid.velocity):
+                value, x = own_part(sim.fluid, value, axis)
+                aside = sum((x[b] - middle[b] - speed[b] * sim.time) * normal[b] for b in range(3))
+                exact = speed[axis] + slide[axis] * (aside > 0)
+                assert np.abs(value - exact)[np.abs(aside) > (0.88 + 0.9 + 0.3) * h].max() < 1e-9

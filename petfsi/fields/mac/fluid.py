@@ -346,14 +346,14 @@ class MacFluid(CoveredGrid):
 
         Without any such faces the arrays themselves are returned. Collective.
         """
-        extended = []
+        extended, slits = [], []
         for axis, v in enumerate(faces):
             self.grid.exchange_faces(axis, v)
             known = v if self.narrow is None else v.copy()
             self._bands[axis].fill(known)
             if self.narrow is not None:
-                slits = (self.openness[axis] < pressure.SLIT) & (self.face_kind[axis] == kinds.PRESSURE)
-                np.copyto(v, known, where=~self.narrow[axis] | slits)
+                slits.append((self.openness[axis] < pressure.SLIT) & (self.face_kind[axis] == kinds.PRESSURE))
+                np.copyto(v, known, where=~self.narrow[axis] | slits[axis])
                 self.grid.fill_sides(v, axis)
             self.grid.fill_sides(known, axis)
             extended.append(known)
@@ -361,7 +361,10 @@ class MacFluid(CoveredGrid):
         if self.sheets is None or not self.sheets.anywhere:
             return new
         # a band takes both sides; and what is narrow now may be read as it is in the next step
-        return self.sheets.renew_faces(new, self.sheets.slim)
+        new = self.sheets.renew_faces(new, self.sheets.slim)
+        for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
+            np.copyto(v, known, where=slit & slim)
+        return new
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
         assert self._smoke_band is not None
