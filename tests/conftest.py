@@ -1,6 +1,7 @@
 """What every test shares: one thread per rank, and of the parallel tests those for the present number of ranks."""
 
 import os
+import sys
 
 for name, value in {
     "OMP_NUM_THREADS": "1",
@@ -13,6 +14,7 @@ for name, value in {
     os.environ.setdefault(name, value)
 
 import pytest  # noqa: E402 - MPI and HDF5 read the environment when they are imported
+from mpi4py import MPI  # noqa: E402
 
 
 @pytest.hookimpl(trylast=True)
@@ -23,3 +25,11 @@ def pytest_collection_modifyitems(config, items):
         match = [item for item in match if not item.get_closest_marker("slow")]
     config.hook.pytest_deselected(items=[item for item in items if item not in match])
     items[:] = match
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_logreport(report):
+    """A test that fails on one rank of several ends them all: the others would wait for it until they are killed."""
+    if report.failed and MPI.COMM_WORLD.size > 1:
+        print(f"\n{report.nodeid}\n{report.longreprtext}", file=sys.__stdout__, flush=True)
+        MPI.COMM_WORLD.Abort(1)
