@@ -108,12 +108,15 @@ class CutCellCoupling(Coupling):
     def _stations(self, positions: np.ndarray) -> list[np.ndarray]:
         """Return where to cut the grid on the way to some positions, them last: sheets must not pass by cells unseen.
 
-        Collective.
+        The way begins where the grid was last cut, which is not where the surface is now: a scheme may take its
+        equations at the beginning of a step or in its middle.
         """
         sheets = self.fluid.sheets
         if sheets is None or not sheets.anywhere:
             return [positions]
-        begin = self.solid.surface_present()
+        begin = self.fluid.cut_at
+        if begin.shape != positions.shape:  # it has not been cut yet
+            return [positions]
         way = positions - begin
         n = max(1, int(np.ceil(np.abs(way / self.fluid.grid.dx).max(initial=0.0) / STRIDE)))
         return [*(begin + k / n * way for k in range(1, n)), positions]

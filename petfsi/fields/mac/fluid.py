@@ -494,7 +494,7 @@ class MacFluid(CoveredGrid):
         """Return divided cells and faces, and what is on them."""
         rank = self.comm.rank
         values = {f"parts_{name}": whole_slab(rank, array) for name, array in self._on_parts().items()}
-        return table.state(rank) | values
+        return table.state(rank) | values | {"cut_at": whole_slab(rank, self.cut_at.ravel())}
 
     def _on_parts(self) -> dict[str, np.ndarray]:
         past = {name: faces.parts for name, faces in self._transport.past.items()}
@@ -505,6 +505,7 @@ class MacFluid(CoveredGrid):
         self.sheets = self._sheets_of(Parts.restored(read))
         self._transport.advection.sheets = self.sheets
         stored = {name: read_whole(read, f"parts_{name}") for name in self._on_parts()}
+        self.cut_at = read_whole(read, "cut_at").reshape(-1, self.dim)
         self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
         self._transport.carried.parts = self.velocity.parts
         for name, parts in stored.items():
@@ -523,6 +524,7 @@ class MacFluid(CoveredGrid):
             for axis in self._axes:
                 self.grid.fill_sides(arrays[axis], axis)
         self.geometry_version += 1
+        self._new_pattern = True  # the solver may hold that of the scene's start
         self._kinds_changed()
         if self.sheets is not None:
             self._restore_parts(read)

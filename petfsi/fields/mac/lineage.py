@@ -131,7 +131,11 @@ class Lineage:
         # what was a cell's own piece is a further one now
         own = np.flatnonzero(source[local.pieces] == WHOLE)
         further[local.pieces[own]] = smoke.reshape(-1)[local.piece_cell[own]]
-        return self.new.guess_smoke(whole, local.gathered(further, local.pieces))
+        # a cell that was whole had one value for all that is in it now
+        before = smoke.copy()
+        flat, _ = local_images(self.grid, None, self.old.table.cell)
+        before.reshape(-1)[flat] = 0.0
+        return self.new.guess_smoke(whole, local.gathered(further, local.pieces), before)
 
 
 def _matched(grid: MacGrid, before: Parts, after: Parts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

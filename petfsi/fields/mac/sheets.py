@@ -221,7 +221,9 @@ class Sheets:
             mine.append(rows)
         faces.parts = self.local.gathered(out, np.concatenate(mine))
 
-    def guess_smoke(self, smoke: np.ndarray, extras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def guess_smoke(
+        self, smoke: np.ndarray, extras: np.ndarray, otherwise: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return smoke with what is not a number replaced by what is known around on its own side. Collective.
 
         Parameters
@@ -230,6 +232,8 @@ class Sheets:
             Cell array, ghosts valid.
         extras : ndarray
             Of further pieces.
+        otherwise : ndarray, optional
+            Cell array: what to take where nothing is known around, as in a film between two sheets; zero by default.
         """
         grid, local = self.grid, self.local
         unknown = np.isnan(smoke)
@@ -242,7 +246,9 @@ class Sheets:
         others = np.column_stack(np.unravel_index(local.piece_cell[use], grid.shape(None))).reshape(-1, 3)
         pieces = np.concatenate((np.zeros(len(cells), np.int64), self.table.piece[rows]))
         where = np.concatenate((cells, others)).astype(np.int64)
-        guess = np.nan_to_num(sided.guess_cells(self.cut, where, pieces, AROUND, smoke, extras))
+        guess = sided.guess_cells(self.cut, where, pieces, AROUND, smoke, extras)
+        rest = np.isnan(guess)
+        guess[rest] = 0.0 if otherwise is None else otherwise[tuple(where[rest].T)]
         smoke, extras = smoke.copy(), extras.copy()
         smoke[tuple(cells.T)] = guess[: len(cells)]
         grid.exchange_cells(smoke)

@@ -410,7 +410,12 @@ class NodalSolid(SolidField):
         self._reference_mass = reference_mass
 
     def _mean_diagonal(self, stage: Stage) -> float:
-        """Return the mean of A's diagonal at rest: what stands in the rows of prescribed unknowns. Collective."""
+        """Return what stands in rows of prescribed unknowns: inertia, in statics the mean of A's diagonal. Collective.
+
+        Stiffness would make |b|, which tolerances are relative to, larger than all that is solved for.
+        """
+        if stage.a > 0:
+            return stage.a * self._reference_mass
         factors, diagonal = self._diagonal
         if factors != (stage.a, stage.k):
             rest = np.zeros((len(self._mesh.points), self.width))
