@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.couplings.base import Coupling
-from petfsi.fields.base import Field, Reader, Slab, SolidField, scalar_slab
+from petfsi.fields.base import Field, Reader, Slab, scalar_slab
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 
@@ -24,22 +24,23 @@ class Accounts:
         with another.
     ``momentum.x``, ...
         Of the fluid, sum_f m_f v_f with m_f = rho alpha_f A_f dx over the faces that the pressure acts on (half of it
-        at open sides), and of the solids. Of ``midpoint``, v is what the step's kick left.
+        at open sides), or of its particles, and of the solids. Of ``midpoint``, v is what the step's kick left.
     ``kinetic``
         sum_f m_f v_f^2 / 2 of the fluid, and the solids' u . M u / 2.
     ``elastic``
-        Energy stored in the solids.
+        Energy stored in the solids, and in the compression of particles.
     ``potential``
         Minus the work of gravity so far: on the solids' mass along the way it went, and on the fluid. Cut cells:
         through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f dt.
     ``dissipated``
-        What Rayleigh damping took so far, sum w . C w dt, with w where the integrator takes the forces.
+        What Rayleigh damping took so far, sum w . C w dt, with w where the integrator takes the forces; and
+        of particles their viscosity, the diffusion of density, and shifting as far as it lowered their weight.
     ``load_work``
         Of the solids' body forces and loads so far, along the way that nodes moved.
     ``boundary_work``
         What came in so far: the supports' reactions, the residual of their equations, times w dt; through inflows
         and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow; and
-        with what closes the volume of regions, pressure times that.
+        with what closes the volume of regions, pressure times that. Minus the energy of particles that left.
     ``energy_residual``
         kinetic + elastic + potential + dissipated - load_work - boundary_work, less its initial value: what the
         scheme's own damping took (negative) or gave, with advection, cuts that change and what linearising a step
@@ -70,7 +71,7 @@ class Accounts:
     ) -> None:  # fmt: skip
         self.comm, self.fields, self.couplings, self.regions = comm, fields, couplings, regions
         self.dim, self._wanted, self._heavy = scene.dim, scene.output.accounts, scene.gravity is not None
-        self._elastic = any(isinstance(field, SolidField) for field in fields)
+        self._elastic = any(field.elastic for field in fields)
         self._loaded = any(solid.loads or solid.body_force for solid in scene.solids.values())
         self._initial = 0.0
         self._sums = np.zeros(4)

@@ -168,14 +168,41 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
 @cli.command()
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--every", type=click.IntRange(min=1), default=1, help="Draw every K-th output only.", metavar="K")
+@click.option(
+    "--color",
+    "colour",
+    type=click.Choice(["smoke", "speed", "pressure", "displacement"]),
+    help="What is coloured; by default the first of these that the run has and that varies.",
+)
+@click.option(
+    "--film",
+    is_flag=False,
+    flag_value="",
+    metavar="[FILE]",
+    help="Draw a film instead: FILE.gif, or FILE.mp4 where ffmpeg is installed; DIR/pictures/film.gif by default.",
+)
+@click.option("--fps", type=float, help="Frames per second of the film; by default real time, within 5 and 30.")
 @click.pass_context
-def plot(ctx: click.Context, directory: Path, every: int) -> NoReturn:
-    """Draw pictures of the run in DIR."""
+def plot(
+    ctx: click.Context, directory: Path, every: int, colour: str | None, film: str | None, fps: float | None
+) -> NoReturn:
+    """Draw pictures of the run in DIR, or a film of it."""
+    if fps is not None and film is None:
+        raise click.UsageError("--fps is the speed of a film: give --film, too", ctx)
 
     def work() -> int:
+        _start_petsc([])  # before the fields' code does, with a signal handler
+        if film is not None:
+            if _launched_rank() > 0:
+                return 0  # a film is one file
+            from petfsi.output.film import film_run
+
+            file, frames, speed = film_run(directory, Path(film) if film else None, every, fps, colour)
+            _say(f"{file}: {frames} frame{'s' if frames != 1 else ''}, {speed:.3g} per second")
+            return 0
         from petfsi.output.pictures import plot_run
 
-        for picture in plot_run(directory, every):
+        for picture in plot_run(directory, every, colour):
             _say(str(picture))
         return 0
 

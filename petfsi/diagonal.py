@@ -1,4 +1,4 @@
-"""The solver of a field that is alone and has a diagonal block: none."""
+"""The solver of a field that is alone and has a diagonal block, or of fields without any: none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from petfsi.system import System
 
 
 class DiagonalSolver:
-    """Divides by the diagonal of the system's operator; has the face of ``solve.Solver`` and reads no option."""
+    """Divides by the diagonal of the system's operator, if it has one.
+
+    It has the face of ``solve.Solver`` and reads no option.
+    """
 
     decoupled = iterates = False
 
@@ -22,7 +25,8 @@ class DiagonalSolver:
 
     def set_up(self) -> None:
         """Take the operator's diagonal. Collective."""
-        self._diagonal = self.system.operator.getDiagonal().array_r.copy()
+        if self.system.fields:
+            self._diagonal = self.system.operator.getDiagonal().array_r.copy()
 
     def solver_of(self, name: str) -> PETSc.KSP | None:
         """Return None: there is none."""
@@ -38,6 +42,8 @@ class DiagonalSolver:
 
     def solve(self, changed: bool, restage: Restage = as_it_is) -> Outcome:
         """Solve for the system's solution; what is not finished is found by its speed."""
+        if not self.system.fields:
+            return Outcome(0, 0.0)
         if changed or self._diagonal is None:
             self.set_up()
         self.system.solution.array = self.system.rhs.array_r / self._diagonal

@@ -13,6 +13,7 @@ import numpy as np
 
 from petfsi import __version__
 from petfsi.errors import InputError
+from petfsi.plan_fluids import ENTRY_BYTES, KRYLOV_VECTORS, PRECONDITIONER, fluid_plan, fluid_skipped
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 
@@ -24,12 +25,6 @@ LARGE = 50_000
 MAX_COUNTED = 100_000
 #: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.
 PROGRAM_BYTES = 250e6
-#: Vectors of the length of all unknowns: those of 30 flexible GMRES iterations, and a few more.
-KRYLOV_VECTORS = 65
-#: A preconditioner holds about as much as this many copies of its matrix.
-PRECONDITIONER = 3.0
-#: Bytes of a matrix entry: a value and a column number.
-ENTRY_BYTES = 12
 
 PACKAGES = (
     "mumps superlu superlu_dist suitesparse mkl_pardiso strumpack hypre ml scalapack metis parmetis ptscotch "
@@ -83,15 +78,9 @@ def skipped(scene: Scene) -> list[str]:
     if scene.fluid is None:
         out.append("fluid, nest and coupling: the scene has no [fluid]; the solid's block alone is solved")
     if not scene.solids:
-        out.append("solid, nest and coupling: the scene has no [solids]; the pressure's block alone is solved")
-    if scene.fluid is not None:
-        out.append("viscous terms: viscosity is 0")
-        if scene.fluid.smoke is None:
-            out.append("smoke: there is no [fluid.smoke]")
-        if not scene.obstacles:
-            out.append("obstacles: there are none")
-        if not scene.solids:
-            out.append("geometry after the first step: sides and obstacles do not move, the matrix stays")
+        alone = "; the pressure's block alone is solved" if scene.fluid and scene.fluid.kind != "sph" else ""
+        out.append(f"solid, nest and coupling: the scene has no [solids]{alone}")
+    out += fluid_skipped(scene)
     if scene.time.integrator == "symplectic-euler" and scene.fluid is None:
         out.append("solver: the mass is lumped, A is diagonal; no option under -fsi_ is read")
     if scene.time.integrator == "static":
@@ -108,19 +97,15 @@ def skipped(scene: Scene) -> list[str]:
 
 
 def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> list[tuple[str, str]]:
-    rows = []
-    unknowns = 0
-    if scene.fluid is not None:
-        n = math.prod(scene.fluid.cells)
-        unknowns += n
-        rows.append(("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, scene.fluid.cells))}"))
+    fluid = fluid_plan(scene)
+    rows, unknowns = list(fluid.rows), fluid.unknowns
     if nodes:
         n = sum(count * (scene.dim if scene.solids[name].shape.beam is None else 3) for name, count in nodes.items())
         unknowns += n
         bodies = "; ".join(f"{name} {nodes[name]:,} nodes, {cells[name]:,} cells" for name in nodes)
         rows.append(("solid", f"{n:,} unknowns ({bodies})"))
     rows.append(("in all", f"{unknowns:,} unknowns"))
-    memory = _state_bytes(scene, sum(nodes.values()), sum(cells.values()))
+    memory = fluid.bytes + _solid_bytes(scene.dim, sum(nodes.values()), sum(cells.values()))
     more = "; much more where a large 3D solid is factorised" if nodes and scene.dim == 3 else ""
     rows.append(("memory", f"about {_bytes(memory)}, and {_bytes(PROGRAM_BYTES)} a rank for the program{more}"))
     time = scene.time
@@ -130,7 +115,7 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
     rows.append(("steps", f"{number} of {dt} s to {time.end:g} s, {time.integrator}"))
     if scene.output.every is not None:
         times = min(_count(time.end, scene.output.every), steps or MAX_COUNTED) + 1
-        size = times * _output_bytes(scene, sum(nodes.values()))
+        size = times * (fluid.output_bytes + 16 * scene.dim * sum(nodes.values()))
         rows.append(("outputs", f"{times:,}, every {scene.output.every:g} s, about {_bytes(size)} in all"))
     every = scene.checkpoint.every
     written = 1 if every is None else min(_count(time.end, every), steps or MAX_COUNTED)
@@ -197,25 +182,12 @@ def _plain_cells(solid: Solid) -> list[int] | None:
     return shape.box.cells if shape.box is not None else None
 
 
-def _state_bytes(scene: Scene, nodes: int, cells: int) -> float:
-    """Return an estimate of what all ranks hold together: state, matrices, preconditioner, Krylov vectors."""
-    dim = scene.dim
-    total = 0.0
-    if scene.fluid is not None:
-        arrays = 8 * (4 * dim + 4) + dim + 5 + (16 if scene.fluid.smoke is not None else 0)
-        matrix = ENTRY_BYTES * (2 * dim + 1) * (1 + PRECONDITIONER)
-        total += math.prod(scene.fluid.cells) * (arrays + matrix + 8 * KRYLOV_VECTORS)
+def _solid_bytes(dim: int, nodes: int, cells: int) -> float:
+    """Return an estimate of what all ranks hold of solids: state, matrices, preconditioner, Krylov vectors."""
     neighbours = 7 if dim == 2 else 15
     matrix = ENTRY_BYTES * dim**2 * neighbours * (1 + PRECONDITIONER)
-    total += nodes * (matrix + 8 * dim * KRYLOV_VECTORS)
     # an element keeps where its matrix goes, the matrix while it is assembled, and its gradients
-    return total + cells * (16 * (dim * (dim + 1)) ** 2 + 8 * dim * (dim + 1))
-
-
-def _output_bytes(scene: Scene, nodes: int) -> float:
-    per_cell = 8 * (scene.dim + 2 + (scene.fluid is not None and scene.fluid.smoke is not None))
-    cells = math.prod(scene.fluid.cells) if scene.fluid is not None else 0
-    return float(cells * per_cell + nodes * 16 * scene.dim)
+    return nodes * (matrix + 8 * dim * KRYLOV_VECTORS) + cells * (16 * (dim * (dim + 1)) ** 2 + 8 * dim * (dim + 1))
 
 
 def _bytes(count: float) -> str:

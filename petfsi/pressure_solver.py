@@ -7,7 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.base import FluidField, SolidField
+from petfsi.fields.base import PressureFluid, SolidField
 from petfsi.modes import DEGREE, LIGHT, LINEAR, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
 from petfsi.resisted import Resisted
@@ -33,11 +33,11 @@ class PressureSolver:
     system : System
     outer : PETSc.KSP
         The solver of the whole.
-    fluid : FluidField
+    fluid : PressureFluid
         The field whose unknown the pressure is.
     """
 
-    def __init__(self, system: System, outer: PETSc.KSP, fluid: FluidField) -> None:
+    def __init__(self, system: System, outer: PETSc.KSP, fluid: PressureFluid) -> None:
         self.system, self.fluid = system, fluid
         self.stand_in: SchurStandIn | None = None
         self._multigrid: Multigrid | None = None

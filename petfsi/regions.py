@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.fields.base import FluidField, Reader, Slab, SolidField
+from petfsi.fields.base import PressureFluid, Reader, Slab, SolidField
 from petfsi.lasting import TABLES, Tracked, bounded_most, looked_up, meeting, pairs
 from petfsi.system import System
 
@@ -51,7 +51,7 @@ class ClosedRegions:
     ----------
     system : System
         The system that has the fluid's block.
-    fluid : FluidField
+    fluid : PressureFluid
         The fluid.
     solid : SolidField or None
         What may bound regions.
@@ -59,7 +59,7 @@ class ClosedRegions:
         Whether the pressure block is inverted by itself: then no source can close a volume.
     """
 
-    def __init__(self, system: System, fluid: FluidField, solid: SolidField | None, decoupled: bool) -> None:
+    def __init__(self, system: System, fluid: PressureFluid, solid: SolidField | None, decoupled: bool) -> None:
         self.system, self.fluid, self.solid = system, fluid, solid
         self.decoupled = decoupled
         self._tracked: Tracked | None = None

@@ -5,7 +5,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-FLUIDS = {"mac": "petfsi.fields.mac.fluid:MacFluid"}
+FLUIDS = {
+    "mac": "petfsi.fields.mac.fluid:MacFluid",
+    "sph": "petfsi.fields.sph.fluid:SphFluid",
+}
 COUPLINGS = {
     "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
     "ray": "petfsi.couplings.ray:RayCoupling",

@@ -32,9 +32,6 @@ from petfsi.simulation import Simulation
 DONE, STOPPED = 0, 75
 Status = Literal["done", "stopped", "failed"]
 
-#: What a row of history.csv says besides the probes, the solver and the accounts.
-ACCOUNTS = ("volume_error", "divergence")
-
 
 class Stop:
     """Whether the run should stop early: a signal, or the wall-time limit.
@@ -88,7 +85,7 @@ class Run:
         """Open what the run writes; of a run that goes on drop all after a step. Collective."""
         simulation = self.simulation
         simulation.report = self.console.note
-        others = [*self.effort(), *ACCOUNTS, *simulation.accounts.columns]
+        others = [*self.effort(), *self.flaws(), *simulation.accounts.columns]
         columns = column_names(simulation.probe_columns(), others)
         self.history = History(self.files.history, columns, self.comm)
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
@@ -173,6 +170,13 @@ class Run:
         newton = {"newton": simulation.outcome.newton} if simulation.solver.iterates else {}
         return newton | ({"substeps": simulation.substeps} if simulation.divides else {})
 
+    def flaws(self) -> dict[str, float]:
+        """Return how far the last step's flow was from keeping volumes, or what else a fluid has to say. Collective."""
+        simulation = self.simulation
+        if simulation.fluid is not None and simulation.regions is None:
+            return simulation.fluid.tally()
+        return {"volume_error": simulation.volume_error, "divergence": simulation.divergence()}
+
     def append_row(self) -> None:
         """Add the present state to the history. Collective."""
         simulation = self.simulation
@@ -186,8 +190,7 @@ class Run:
                 "iterations": simulation.outcome.iterations,
                 "residual": simulation.outcome.residual,
                 **self.effort(),
-                "volume_error": simulation.volume_error,
-                "divergence": simulation.divergence(),
+                **self.flaws(),
                 **simulation.accounts.values,
             }
         )
@@ -216,6 +219,12 @@ class Run:
         )
         simulation.forget()
 
+    def conservation(self) -> dict[str, float]:
+        """Return what the run kept, and how well. Not collective."""
+        simulation = self.simulation
+        of_pressure = simulation.fluid is None or simulation.regions is not None
+        return ({"volume_error": self.volume_error} if of_pressure else {}) | simulation.accounts.values
+
     def summarise(self, status: Status) -> None:
         """Write summary.json. Collective."""
         write_summary(self.files.summary, self.summary(status), self.comm)
@@ -234,7 +243,7 @@ class Run:
             phases=simulation.phases,
             iterations={"mean": float(np.mean(iterations)), "max": max(iterations)},
             assemblies=simulation.assemblies(),
-            conservation={"volume_error": self.volume_error, **simulation.accounts.values},
+            conservation=self.conservation(),
             probes=self.probes,
             skipped=skipped(simulation.scene),
             versions=versions(),
@@ -325,5 +334,7 @@ def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
+    for note in simulation.fluid.notes if simulation.fluid else []:
+        console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")

@@ -14,7 +14,7 @@ from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import SolveError
-from petfsi.fields.base import Field, FluidField, Reader, Slab, SolidField
+from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
@@ -23,6 +23,12 @@ from petfsi.substeps import StableStep
 from petfsi.system import System
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
+
+#: Probed quantities that are numbers; the others are vectors.
+SCALARS = ("pressure", "smoke", "angle", "front", "level")
+
+#: The solution of a field without unknowns.
+NOTHING = np.zeros(0)
 
 #: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
 #: is left.
@@ -55,7 +61,7 @@ class Simulation:
         self.comm = comm
         self.scene = scene
         self._stepping = Stepping(scene.time)
-        self.step, self.time, self.dt = 0, 0.0, self._stepping.length(0.0)
+        self.step, self.time = 0, 0.0
         self.fields = build.build_fields(comm, scene)
         self.couplings = build.build_couplings(scene, self.fields)
         self.solid = next((field for field in self.fields if isinstance(field, SolidField)), None)
@@ -64,13 +70,14 @@ class Simulation:
             self.solid.set_scale(self.fluid.density * self.fluid.cell_volume)
         self.system = System(comm, self.fields, self.couplings)
         self.solver = self._make_solver()
-        self.stable = StableStep(self.solid, scene.time)
+        self.stable = StableStep(self.fields, scene.time)
+        self.dt = self._stepping.length(0.0)
         # an explicit step fails for being too long, which is found before it is taken
         self._retries = 0 if self.stable.limited else scene.time.retries
         self.substeps = 1
         self.report: Callable[[str], None] = lambda text: None
         self.regions: ClosedRegions | None = None
-        if self.fluid:
+        if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.outcome = Outcome(0, 0.0)
@@ -78,7 +85,7 @@ class Simulation:
         self.phases = dict.fromkeys(PHASES, 0.0)
 
     def _make_solver(self) -> Solver | DiagonalSolver:
-        if self.solid and self.solid.explicit and len(self.fields) == 1:
+        if all(field.explicit for field in self.system.fields) and len(self.system.fields) < 2:
             return DiagonalSolver(self.system)
         return Solver(self.system, static=self.scene.time.integrator == "static")
 
@@ -108,13 +115,19 @@ class Simulation:
             On all ranks; the state is then that of the failed step and must not be used.
         """
         t = self.time
-        dt = self.dt = self._stepping.length(t)
+        dt = self.dt = self._length(t)
         n = self.stable.count(t, dt)
         self.substeps, self.outcome, self.volume_error = 0, Outcome(0, 0.0), 0.0
         for number in range(n):
             self._take(t + number * dt / n, dt / n, self._retries)
         self.step += 1
         self.time = self._stepping.after(self.step, t, dt)
+
+    def _length(self, t: float) -> float:
+        """Return the length of the step that begins at t, no more than the time between outputs if it is free."""
+        if not self._stepping.auto:
+            return self._stepping.length(t)
+        return min(self._stepping.length(t, self.stable.present()[0]), self.scene.output.every or np.inf)
 
     def _take(self, t: float, dt: float, retries: int) -> None:
         """Take a step, or two halves in its place if it fails and so on, at most ``retries`` times. Collective."""
@@ -142,7 +155,7 @@ class Simulation:
             outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
         with self.phase("accept"):
             self._accept(t, dt)
-            if len(self.fields) > 1 or not self.stable.limited:  # else no step makes any
+            if len(self.system.fields) > 1 or not self.stable.limited:  # else no step makes any
                 petsc.collect_garbage()
         self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
 
@@ -166,6 +179,7 @@ class Simulation:
 
         Collective. Returns the options of others that nothing reads.
         """
+        self.dt = self._length(self.time)
         self.stable.count(self.time, self.dt)
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
@@ -197,7 +211,7 @@ class Simulation:
         if not self.regions or not self.solid or isinstance(self.solver, DiagonalSolver):
             return outcome
         for repeat in range(REPEATS + 1):
-            self.regions.measure(self.system.values()[self.fields.index(self.solid)], dt)
+            self.regions.measure(self.system.values()[self.system.fields.index(self.solid)], dt)
             if repeat == REPEATS or self.solver.fixed_iterations or not self.regions.improve():
                 break
             self.system.refresh(guess=False)
@@ -207,7 +221,7 @@ class Simulation:
     def _restage(self, values: list[np.ndarray], t: float, dt: float) -> bool:
         """Make the system that of other values of the fields; return whether the operator has changed. Collective."""
         # not any(): every field must hear
-        if not sum([field.relinearise(x) for field, x in zip(self.fields, values, strict=True)]):
+        if not sum([field.relinearise(x) for field, x in zip(self.system.fields, values, strict=True)]):
             return False
         parts: list[Field | Coupling] = [*self.fields, *self.couplings]
         for part in parts:
@@ -217,7 +231,7 @@ class Simulation:
     def _accept(self, t: float, dt: float) -> None:
         if self.regions:
             self.volume_error = max(self.volume_error, self.regions.volume_error(dt))
-        values = dict(zip((field.name for field in self.fields), self.system.values(), strict=True))
+        values = dict(zip((field.name for field in self.system.fields), self.system.values(), strict=True))
         if self.solid:
             self._check_speed(self.solid, values["solid"], dt)
             self.solid.judge(values["solid"], dt)
@@ -225,7 +239,7 @@ class Simulation:
         for coupling in self.couplings:
             coupling.accept(t, dt)
         if self.fluid:
-            self.fluid.accept(values["pressure"], t, dt)
+            self.fluid.accept(values.get(self.fluid.name, NOTHING), t, dt)
         if self.regions:
             self.regions.settle()
         remark = self.solid.remark(dt) if self.solid else None
@@ -254,17 +268,17 @@ class Simulation:
         """Return the probes' present values, one per column. Collective."""
         return [value for _, value in self._probe_values(self._measure)]
 
-    def _measure(self, of: str, at: list[float], quantity: str) -> np.ndarray | float:
-        if of == "fluid":
+    def _measure(self, of: str, at: list[float] | None, quantity: str) -> np.ndarray | float:
+        if of == "fluid" or quantity == "force":
             assert self.fluid is not None  # the scene was checked
-            return self.fluid.probe(quantity, at)
-        assert self.solid is not None
+            return self.fluid.force_on(of) if quantity == "force" else self.fluid.probe(quantity, at or [])
+        assert self.solid is not None and at is not None
         return self.solid.probe(of, at, quantity)
 
     def _probe_values(self, measure: Callable) -> Iterator[tuple[str, float]]:
         for name, spec in self.scene.probes.items():
             value = measure(spec.of, spec.at, spec.quantity)
-            if spec.quantity in ("pressure", "smoke", "angle"):
+            if spec.quantity in SCALARS:
                 yield name, float(np.ravel(value)[0])
             else:
                 yield from ((f"{name}.{axis}", float(v)) for axis, v in zip("xyz", value, strict=False))
@@ -274,7 +288,7 @@ class Simulation:
 
         Collective.
         """
-        if self.fluid is None:
+        if not isinstance(self.fluid, PressureFluid):
             return 0.0
         outflow = self.system.residual.array[self.system.piece(self.fluid.name)] / self.fluid.row_scale
         area = self.fluid.cell_volume ** ((self.scene.dim - 1) / self.scene.dim)
@@ -283,7 +297,7 @@ class Simulation:
     def assemblies(self) -> dict[str, int]:
         """Return how often each block was assembled."""
         return {
-            **{field.name: field.n_assembled for field in self.fields},
+            **{field.name: field.n_assembled for field in self.system.fields},
             **{"-".join(next(iter(coupling.blocks))): coupling.n_assembled for coupling in self.couplings},
         }
 

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import FluidField
+from petfsi.fields.base import PressureFluid
 from petfsi.multigrid import Hierarchy
 from petfsi.newton import Newton, Restage, as_it_is, snes_type
 from petfsi.option_stories import option_story, petsc_text
@@ -208,7 +208,7 @@ class Solver:
         ksp.setFromOptions()
         if system.index_sets and ksp.getPC().getType() == PETSc.PC.Type.FIELDSPLIT:
             ksp.getPC().setFieldSplitIS(*system.index_sets)  # heard only between setFromOptions and setUp
-        fluid = next((field for field in system.fields if isinstance(field, FluidField)), None)
+        fluid = next((field for field in system.fields if isinstance(field, PressureFluid)), None)
         if fluid is not None and not self.converts:
             self._pressure = PressureSolver(system, ksp, fluid)
             if not system.index_sets:

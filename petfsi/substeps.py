@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import Reader, Slab, SolidField, scalar_slab
+from petfsi.fields.base import Field, Reader, Slab, SolidField, scalar_slab
 from petfsi.scene.schema import Time
 
 #: The stable step is found anew after so many steps at most,
@@ -23,14 +24,15 @@ MOST = 100_000
 class StableStep:
     """Keeps a step below the stable one, as ``time.above_limit`` says.
 
-    Finding the stable step costs some 30 steps. It is found before the first step, every ``EVERY`` steps, and when
-    the body may have changed too much since: the ends of an edge can have moved apart by twice the way of the fastest
-    node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once is enough where it never
-    changes. A run that goes on knows the one last found: else it might divide its steps otherwise.
+    Finding a solid's stable step costs some 30 steps. It is found before the first step, every ``EVERY`` steps, and
+    when the body may have changed too much since: the ends of an edge can have moved apart by twice the way of the
+    fastest node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once is enough where it
+    never changes. A run that goes on knows the one last found: else it might divide its steps otherwise. That of other
+    fields costs little and is found before each step. The smallest counts.
 
     Parameters
     ----------
-    solid : SolidField or None
+    fields : sequence of Field
     time : Time
         Of the scene.
 
@@ -39,12 +41,15 @@ class StableStep:
     limited : bool
         Whether there is a stable step at all.
     limit : float
-        The one last found, s; inf at first.
+        A solid's, the one last found, s; inf at first.
     """
 
-    def __init__(self, solid: SolidField | None, time: Time) -> None:
-        self._solid = solid
-        self.limited = solid is not None and solid.explicit
+    def __init__(self, fields: Sequence[Field], time: Time) -> None:
+        explicit = [field for field in fields if field.explicit]
+        self._solid = next((field for field in explicit if isinstance(field, SolidField)), None)
+        self._others = [field for field in explicit if not isinstance(field, SolidField)]
+        self._scheme = time.integrator
+        self.limited = bool(explicit)
         self._subcycles = time.above_limit == "subcycle"
         self.limit = math.inf
         self._steps, self._way, self._stretch = EVERY, 0.0, 0.0
@@ -53,6 +58,14 @@ class StableStep:
     def divides(self) -> bool:
         """Whether a step may be divided."""
         return self.limited and self._subcycles
+
+    def present(self) -> tuple[float, str]:
+        """Return the stable step now, s, and whose it is. Collective."""
+        found = [(field.stable_step(), f"the {field.name}") for field in self._others]
+        if self._solid is not None:
+            self._find()
+            found.append((self.limit, self._scheme))
+        return min(found)
 
     def count(self, t: float, dt: float) -> int:
         """Return into how many equal steps one of length dt that begins at t must be divided. Collective.
@@ -66,16 +79,16 @@ class StableStep:
         """
         if not self.limited:
             return 1
-        self._find()
+        limit, whose = self.present()
         if self._subcycles:
-            if not dt < MOST * self.limit:
-                raise SolveError(f"the solid has blown up: its stable step is {self.limit:.4g} s at t = {t:g} s")
-            return max(1, math.ceil(dt / (MARGIN * self.limit)))
-        if dt > self.limit:
+            if not dt < MOST * limit:
+                raise SolveError(f"the stable step of {whose} has shrunk to {limit:.4g} s at t = {t:g} s: blown up")
+            return max(1, math.ceil(dt / (MARGIN * limit)))
+        if not dt <= limit:
             kind = InputError if t == 0 else SolveError
             raise kind(
-                f"time.dt = {dt:g}: the stable step of symplectic-euler is {self.limit:.4g} s at t = {t:g} s; set "
-                f'time.dt below it, or time.above_limit = "subcycle"'
+                f"time.dt = {dt:g}: the stable step of {whose} is {limit:.4g} s at t = {t:g} s; set "
+                f'time.dt below it, or to "auto", or time.above_limit = "subcycle"'
             )
         return 1
 
@@ -92,8 +105,7 @@ class StableStep:
 
     def moved(self, way: float) -> None:
         """Count a step in which no node moved farther than ``way``, m."""
-        assert self._solid is not None
-        if not self._solid.is_linear:
+        if self._solid is not None and not self._solid.is_linear:
             self._steps, self._way = self._steps + 1, self._way + way
 
     def state(self, comm: MPI.Comm) -> dict[str, Slab]:

@@ -20,7 +20,8 @@ class System:
         sum_j  r_i K_ij c_j  (x_j / c_j)  =  r_i b_i ,
 
     where r and c are the fields' row and column scales: all residuals and unknowns are then comparable numbers
-    (m/s where there is a fluid). A single field needs no nest; its block is the operator.
+    (m/s where there is a fluid). A single field needs no nest; its block is the operator. Fields without a block are
+    left out, and where none has one there is no operator, and no vector.
 
     Parameters
     ----------
@@ -32,6 +33,8 @@ class System:
 
     Attributes
     ----------
+    fields : list of Field
+        Those with a block.
     operator : PETSc.Mat
         The nest, or the single block; the same object for the whole run.
     rhs, solution : PETSc.Vec
@@ -44,12 +47,12 @@ class System:
         self, comm: MPI.Comm, fields: Sequence[Field], couplings: Sequence[Coupling], before: System | None = None
     ) -> None:
         self.comm = comm
-        self.fields = list(fields)
+        self.fields = [field for field in fields if field.has_block]
         self.couplings = list(couplings)
         self.index_sets: list[tuple[str, PETSc.IS]] = []
         if len(self.fields) == 1:
             self.operator = self.fields[0].block
-        else:
+        elif self.fields:
             names = [field.name for field in self.fields]
             rows: list[list[PETSc.Mat | None]] = [[None] * len(names) for _ in names]
             for n, field in enumerate(self.fields):
@@ -60,8 +63,9 @@ class System:
             self.operator = PETSc.Mat().createNest(rows, comm=comm)
             self.operator.setUp()
             self.index_sets = list(zip(names, self.operator.getNestISs()[0], strict=True))
-        self.solution, self.rhs = self.operator.createVecs()
-        self.residual = self.rhs.duplicate()
+        if self.fields:
+            self.solution, self.rhs = self.operator.createVecs()
+            self.residual = self.rhs.duplicate()
         offsets = np.cumsum([0] + [field.layout.n_local for field in self.fields])
         self._pieces = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
         # a block that stays was scaled already, unless it has been assembled since
@@ -141,7 +145,9 @@ class System:
         return sum(field.rhs_round_off() for field in self.fields)
 
     def values(self, of: PETSc.Vec | None = None) -> list[np.ndarray]:
-        """Return the solution (or another vector) of each field on this rank, SI."""
+        """Return the solution (or another vector) of each field that has a block on this rank, SI."""
+        if not self.fields:
+            return []
         x = (self.solution if of is None else of).array_r
         return [x[piece] * field.col_scale for field, piece in zip(self.fields, self._pieces, strict=True)]
 

@@ -9,7 +9,7 @@ from solid_cases import body, field
 from petfsi.fields.solid.elements import State
 from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.surfaces import boundary_facets
-from petfsi.scene.schema import Box
+from petfsi.scene.tables import Box
 
 COMM = MPI.COMM_WORLD
 SIZE = np.array([1.5, 1.0, 0.8])

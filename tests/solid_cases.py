@@ -12,7 +12,8 @@ from petfsi.fields.solid.patches import grid_patches, grouped_mesh
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.geometry.meshes import SimplexMesh, box_mesh
 from petfsi.geometry.quadratic import with_middles
-from petfsi.scene.schema import Box, Scene
+from petfsi.scene.schema import Scene
+from petfsi.scene.tables import Box
 
 DENSITY, YOUNG, POISSON = 1.3, 20.0, 0.3
 LAME, MU = lame_parameters(YOUNG, POISSON)

@@ -104,7 +104,7 @@ def test_resume_passes_everything_on(calls):
 
 def test_plot_names_its_pictures(monkeypatch, capsys):
     module = types.ModuleType("petfsi.output.pictures")
-    module.plot_run = lambda directory, every: [directory / f"{every}.png"]
+    module.plot_run = lambda directory, every, colour: [directory / f"{every}.png"]
     monkeypatch.setitem(sys.modules, "petfsi.output.pictures", module)
     assert cli.main(["plot", "runs/a", "--every", "5"]) == 0
     assert capsys.readouterr().out == "runs/a/5.png\n"

@@ -31,7 +31,7 @@ from petfsi.fields.solid.spectrum import TOLERANCE, largest_eigenvalue
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.quadratic import shape_forms
-from petfsi.scene.schema import Ball, Box
+from petfsi.scene.tables import Ball, Box
 
 KINDS = [(order, rule) for order in ("linear", "quadratic") for rule in ("full", "reduced")]
 MATERIALS = ["green", "linear", "neohookean", "stable-neohookean"]

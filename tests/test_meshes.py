@@ -8,7 +8,8 @@ from petfsi.errors import InputError
 from petfsi.geometry.meshes import SimplexMesh, box_mesh, build_mesh, read_surface
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, shells, signed_volumes
-from petfsi.scene.schema import Box, Shape, Solid
+from petfsi.scene.schema import Solid
+from petfsi.scene.tables import Box, Shape
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 TWO_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -203,7 +203,7 @@ BROKEN = [
         "'front', 'all', 'start' or 'end' (or a shape",
     ),
     (["obstacles.floor.outside='yes'"], 'obstacles.floor.outside = "yes"', "must be true or false"),
-    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'velocity', 'angle', 'pressure' or"),
+    (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'velocity', 'angle', 'pressure', "),
     (["time.above_limit=ignore"], 'time.above_limit = "ignore"', "must be 'refuse' or 'subcycle'"),
     (["time.retries=-1"], "time.retries = -1", "must be 0 or more"),
     (["time.retries=21"], "time.retries = 21", "must be 20 or less"),

@@ -13,7 +13,7 @@ from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.seams import find_seams
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.scene.load import scene_from_dict
-from petfsi.scene.schema import Box
+from petfsi.scene.tables import Box
 from petfsi.simulation import Simulation
 
 COMM = MPI.COMM_WORLD

@@ -29,7 +29,7 @@ from petfsi.fields.solid.elements import CHUNK
 from petfsi.fields.solid.materials import lame_parameters
 from petfsi.geometry.meshes import box_mesh
 from petfsi.integrators import INTEGRATORS
-from petfsi.scene.schema import Box
+from petfsi.scene.tables import Box
 
 
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])

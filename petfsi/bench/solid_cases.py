@@ -14,7 +14,8 @@ from mpi4py import MPI
 from petfsi.geometry.meshes import box_mesh
 from petfsi.ranks import on_root
 from petfsi.scene.load import scene_from_dict
-from petfsi.scene.schema import Box, Scene
+from petfsi.scene.schema import Scene
+from petfsi.scene.tables import Box
 
 #: Finite strain, plane strain, a dead shear of 6.25 on the right edge; the middle of that edge, (48, 52), moves by so
 #: much in x and y, by the ratio of Poisson. Derived by tensor-product elements of order 3 to 5; +-0.0005 and +-0.005.

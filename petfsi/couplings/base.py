@@ -77,7 +77,7 @@ class Coupling(ABC):
         """Return this rank's share of what the coupling's own forces did in the step last accepted.
 
         Supports bear the pressure on prescribed points, and the fluid's weight there: minus that is their work. What
-        comes into cells from nowhere (``FluidField.source``) brings its volume times the pressure.
+        comes into cells from nowhere (``PressureFluid.source``) brings its volume times the pressure.
 
         Parameters
         ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -108,6 +109,10 @@ class Field(ABC):
     ----------
     name : str
         Index in the nest, options prefix and checkpoint group.
+    has_block : bool
+        Whether it has unknowns; without, it is left out of the system, and nothing that is said of unknowns holds.
+    explicit, elastic : bool
+        Whether its step is limited, see ``stable_step``; whether it stores energy.
     layout : Layout
         How its unknowns lie on the ranks.
     block : PETSc.Mat
@@ -124,6 +129,9 @@ class Field(ABC):
     """
 
     name: str
+    has_block: bool = True
+    explicit: bool = False
+    elastic: bool = False
     layout: Layout
     block: PETSc.Mat
     rhs: np.ndarray
@@ -137,9 +145,9 @@ class Field(ABC):
         """What the solver scales: the block, and what stands for a part of it in preconditioners."""
         return [self.block]
 
-    @abstractmethod
     def unknown(self) -> np.ndarray:
         """Return the present values of the unknowns on this rank, SI: the first guess of the solve."""
+        return np.zeros(0)
 
     @abstractmethod
     def predict(self, time: float, dt: float) -> None:
@@ -152,6 +160,10 @@ class Field(ABC):
     @abstractmethod
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Take the solution (SI) of the step from ``time`` to ``time + dt`` and move all that moves with it."""
+
+    def stable_step(self) -> float:
+        """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
+        return math.inf
 
     def rewind(self) -> None:
         """Forget the step that ``predict`` began and that will not be accepted, as if it had not been tried."""
@@ -209,7 +221,7 @@ class Field(ABC):
 
 
 class FluidField(Field):
-    """A fluid: its unknown is the pressure, and its row of the system the net outflow of a cell.
+    """A fluid of whatever kind.
 
     Attributes
     ----------
@@ -218,7 +230,36 @@ class FluidField(Field):
     density : float
         kg/m^3.
     cell_volume : float
-        Volume of a typical cell, m^3 (m^2 in 2D).
+        Volume of a typical cell, or of a particle at rest, m^3 (m^2 in 2D).
+    """
+
+    comm: MPI.Comm
+    density: float
+    cell_volume: float
+
+    @abstractmethod
+    def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
+        """Return a quantity at a point, the same on all ranks. Collective."""
+
+    def force_on(self, wall: str) -> np.ndarray:
+        """Return the force on a side or an obstacle, shape (dim,), N, the same on all ranks. Collective."""
+        raise NotImplementedError
+
+    def tally(self) -> dict[str, float]:
+        """Return what of itself history.csv should say, always under the same names. Collective."""
+        return {}
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of how it begins."""
+        return []
+
+
+class PressureFluid(FluidField):
+    """A fluid whose unknown is the pressure, and whose row of the system is the net outflow of a cell.
+
+    Attributes
+    ----------
     geometry_version : int
         Grows whenever cells or faces change their kind; the same on all ranks.
     n_cells : int
@@ -230,9 +271,6 @@ class FluidField(Field):
         By unknown, what comes into cells from nowhere, m^3/s (m^2/s in 2D): ``assemble`` adds it to ``rhs``.
     """
 
-    comm: MPI.Comm
-    density: float
-    cell_volume: float
     n_cells: int
     fluxes: PETSc.Mat
     geometry_version: int = 0
@@ -266,10 +304,6 @@ class FluidField(Field):
     def read_cells(self, read: Reader, name: str) -> np.ndarray:
         """Return what ``cells_slab`` stored, shape (n_cells,), on any number of ranks."""
 
-    @abstractmethod
-    def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
-        """Return a quantity at a point, the same on all ranks. Collective."""
-
 
 class SolidField(Field):
     """A solid: its unknowns are velocities, and its surface is where a fluid meets it.
@@ -280,25 +314,19 @@ class SolidField(Field):
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
         By how much this rank's nodes moved in the step last accepted, m.
-    explicit : bool
-        Whether its block is diagonal and its step limited, see ``stable_step``.
     is_linear : bool
         Whether its tangent never changes, and neither does the stable step.
     """
 
+    elastic = True
     extent: float
     moved: np.ndarray
-    explicit: bool = False
     is_linear: bool = False
 
     @property
     @abstractmethod
     def finest(self) -> float:
         """Length of its shortest edge at rest, m. Collective at first."""
-
-    @abstractmethod
-    def stable_step(self) -> float:
-        """Return the longest stable step of an explicit scheme at the present state, s. Collective."""
 
     def judge(self, x: np.ndarray, dt: float) -> None:
         """Raise unless the solution x (SI) of a step of dt can be accepted. Collective.

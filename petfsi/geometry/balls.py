@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 
-from petfsi.scene.schema import Ball
+from petfsi.scene.tables import Ball
 
 #: How large the undistorted square in the middle is, and how far directions are spread evenly over the sphere
 #: rather than over the cube (0 to 1). Of the maps tried these give about the best-shaped worst simplex.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from petfsi.scene.schema import Beam
+from petfsi.scene.tables import Beam
 
 #: Nodes of an element along the axis, in the order start, end, middle.
 _ELEMENT = {"timoshenko": np.array([0, 2, 1]), "euler-bernoulli": np.array([0, 1])}

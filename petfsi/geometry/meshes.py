@@ -19,7 +19,8 @@ from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
-from petfsi.scene.schema import Box, Shape, Solid
+from petfsi.scene.schema import Solid
+from petfsi.scene.tables import Box, Shape
 
 if TYPE_CHECKING:
     import meshio

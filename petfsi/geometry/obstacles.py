@@ -14,7 +14,8 @@ from petfsi.geometry.balls import unit_ball
 from petfsi.geometry.meshes import read_surface
 from petfsi.geometry.seams import MEET, Seams, find_seams
 from petfsi.geometry.surfaces import boundary_facets
-from petfsi.scene.schema import Ball, Box, Cylinder, Halfspace, Obstacle, Scene
+from petfsi.scene.schema import Obstacle, Scene
+from petfsi.scene.tables import Ball, Box, Cylinder, Halfspace
 
 #: The most facets that one round obstacle is made of.
 MAX_FACETS = 4_000_000
@@ -61,7 +62,7 @@ def obstacle_surfaces(scene: Scene) -> ObstacleSurfaces:
     fluid = scene.fluid
     assert fluid is not None, "only a fluid feels obstacles"
     low, size = np.array(fluid.origin), np.array(fluid.size)
-    spacing = float((size / fluid.cells).min())
+    spacing = fluid.resolution
     periodic = [getattr(fluid.sides, side) == "periodic" for side in ("left", "bottom", "back")[: scene.dim]]
     points, facets, mistakes, count = [np.zeros((0, scene.dim))], [np.zeros((0, scene.dim), dtype=np.int64)], [], 0
     for name, obstacle in scene.obstacles.items():

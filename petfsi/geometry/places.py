@@ -10,7 +10,8 @@ from petfsi.errors import InputError
 from petfsi.geometry.meshes import CELL_TYPE, FACET_TYPE, open_mesh
 from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.shapes import inside
-from petfsi.scene.schema import Shape, Solid, Tagged
+from petfsi.scene.schema import Solid, Tagged
+from petfsi.scene.tables import Shape
 
 #: Nodes this far from a side of the bounding box, as a fraction of its size, lie on it (files may hold single
 #: precision).

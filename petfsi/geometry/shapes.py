@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from petfsi.scene.schema import Shape
+from petfsi.scene.tables import Shape
 
 #: Points this far outside, as a fraction of the shape's size, still count as inside: a point on the boundary
 #: must not change sides with round-off.

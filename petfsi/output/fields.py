@@ -41,7 +41,7 @@ class FieldWriter:
         self.comm = comm
         self.grid = grid
         self._mesh = self.directory / "fields" / "mesh.h5"
-        self._static: Arrays = {}
+        self._static: Arrays | None = None  # until there is a mesh.h5, which has no arrays where nothing is fixed
         self._entries: list[Entry] = []
         self._static, self._entries = on_root(comm, self._find)
 
@@ -60,7 +60,8 @@ class FieldWriter:
         groups : mapping of str to mapping of str to Slab
             ``pressure``: cell data of the grid, (nx, ny[, nz]) or with components last. ``solid``: ``points``
             (reference), ``cells`` and ``body``, which never change, and ``displacement``, ``velocity`` and
-            whatever else there is per node or per cell.
+            whatever else there is per node or per cell. ``particles``: ``points`` and whatever else there is per
+            particle; their number is the file's own, and may be zero.
 
         Raises
         ------
@@ -68,19 +69,13 @@ class FieldWriter:
             On all ranks, when the disk does not take it; earlier output is untouched.
         """
         path = self.directory / "fields" / f"{step:06d}.h5"
-        fluid, solid = groups.get("pressure", {}), groups.get("solid", {})
-        arrays = {f"fluid/{name}": _z_first(slab, len(self.grid.cells)) for name, slab in fluid.items() if self.grid}
-        # for readers that want a list of cells
-        views = {f"cells/{path[6:]}": hdf5.View(path, self._listed(slab.shape)) for path, slab in arrays.items()}
-        arrays |= {f"solid/{name}": slab for name, slab in solid.items() if name not in STATIC}
-        if solid:
-            arrays["solid/points"] = _moved(solid["points"], solid["displacement"])
+        arrays, views = self._arrays(groups)
         about = {"step": step, "time": time}
         needed = hdf5.n_bytes(arrays)
         try:
             on_root(self.comm, lambda: path.parent.mkdir(exist_ok=True))
-            if not self._static:
-                self._write_mesh(solid)
+            if self._static is None:
+                self._write_mesh(groups.get("solid", {}))
             part = files.part_of(path)
             hdf5.write_file(part, arrays, about, self.comm, views)
             entry = Entry(step, time, f"fields/{path.name}", _described(arrays, views))
@@ -90,6 +85,19 @@ class FieldWriter:
         except OSError as error:
             self._fail(f"step {step}, t = {time:g} s: fields {path} could not be written", error, needed)
         return path
+
+    def _arrays(self, groups: Mapping[str, Mapping[str, Slab]]) -> tuple[dict[str, Slab], dict[str, hdf5.View]]:
+        """Return what the file of one time holds, and the second names in it for readers that want a list of cells."""
+        fluid, solid, particles = (groups.get(name, {}) for name in ("pressure", "solid", "particles"))
+        arrays = {f"fluid/{name}": _z_first(slab, len(self.grid.cells)) for name, slab in fluid.items() if self.grid}
+        views = {f"cells/{path[6:]}": hdf5.View(path, self._listed(slab.shape)) for path, slab in arrays.items()}
+        arrays |= {f"solid/{name}": slab for name, slab in solid.items() if name not in STATIC}
+        if solid:
+            arrays["solid/points"] = _moved(solid["points"], solid["displacement"])
+        arrays |= {f"particles/{name}": slab for name, slab in particles.items()}
+        if particles:
+            arrays["particles/vertices"] = _vertices(particles["points"])
+        return arrays, views
 
     def truncate(self, step: int) -> None:
         """Drop the output after a step, and what an interrupted write left."""
@@ -120,13 +128,16 @@ class FieldWriter:
 
     def _index(self) -> None:
         mesh = self._mesh.relative_to(self.directory).as_posix()
-        for name, text in xdmf.indexes(mesh, self._static, self._entries, self.grid).items():
+        texts = xdmf.indexes(mesh, self._static or {}, self._entries, self.grid)
+        for name, text in texts.items():
             files.replace_text(self.directory / name, text)
+        if xdmf.CLOUDS not in texts:  # of output that has been dropped
+            (self.directory / xdmf.CLOUDS).unlink(missing_ok=True)
 
-    def _find(self) -> tuple[Arrays, list[Entry]]:
+    def _find(self) -> tuple[Arrays | None, list[Entry]]:
         """Return the mesh's arrays and the entries of the files that are there."""
         if not self._mesh.exists():
-            return {}, []
+            return None, []
         try:
             entries = []
             for path in field_files(self.directory):
@@ -140,7 +151,7 @@ class FieldWriter:
 
     def _remove_others(self) -> None:
         kept = {self.directory / entry.file for entry in self._entries}
-        if self._static:
+        if self._static is not None:
             self._index()  # before the files go, so that the index never names one that is gone
         for path in field_files(self.directory):
             if path not in kept:
@@ -180,6 +191,13 @@ def _moved(points: Slab, displacement: Slab) -> Slab:
     if tuple(points.start) != tuple(displacement.start) or points.data.shape != displacement.data.shape:
         raise ValueError("a solid's points and displacement must be cut into pieces alike")
     return Slab(points.data + displacement.data, displacement.start, displacement.shape)
+
+
+def _vertices(points: Slab) -> Slab:
+    """Return the particles' own numbers: the cells of a cloud of points, of one corner each, which readers ask for."""
+    n, start = points.shape[0], points.start[0]
+    numbers = np.arange(start, start + len(points.data), dtype=np.int32 if n < 2**31 else np.int64)
+    return Slab(numbers[:, None], (start, 0), (n, 1))
 
 
 def _grid_cells(grid: GridInfo, comm: MPI.Comm) -> dict[str, Slab]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import LightSource, ListedColormap, Normalize, to_rgb
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.colors import LightSource, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
@@ -26,17 +22,11 @@ from petfsi.geometry.surfaces import boundary_facets
 from petfsi.output.fields import field_files
 from petfsi.output.history import read_history
 from petfsi.output.slices import cut_tetrahedra
-from petfsi.output.xdmf import GridInfo
+from petfsi.output.stage import SHOWN, Frame, Stage, look_through, quantity, read_frame
+from petfsi.output.surroundings import GREY, LINE, draw_obstacles, draw_sides
 
-#: What may be shown, the first of a fluid that varies by more than so much: label, colours, and that much.
-_SHOWN = {
-    "smoke": ("smoke", "magma", 1e-6),
-    "speed": ("speed, m/s", "viridis", 1e-6),
-    "pressure": ("pressure, Pa", "cividis", 1e-9),
-    "displacement": ("displacement, m", "viridis", 0.0),
-}
-_BODIES = ("#f3dcbd", "#c7dff0", "#d5ecc9", "#f2cdd6", "#e0d3ee")
-_LINE, _GREY = "#4a3b2c", "#8c8c8c"
+#: The colours of bodies, in turn.
+BODIES = ("#f3dcbd", "#c7dff0", "#d5ecc9", "#f2cdd6", "#e0d3ee")
 #: More edges than this are a dark stain, not a mesh.
 _MANY_EDGES = 6000
 #: Arrows along the longer side of a plane.
@@ -44,38 +34,19 @@ _ARROWS = 30
 _DPI = 130
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """What one output file holds; cell data as (nx, ny[, nz])."""
-
-    step: int
-    time: float
-    fluid: dict[str, np.ndarray]
-    points: np.ndarray | None
-    displacement: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class _Stage:
-    """What is the same in all pictures."""
-
-    grid: GridInfo | None
-    cells: np.ndarray
-    body: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    shown: str
-    norm: Normalize
-
-    @property
-    def dim(self) -> int:
-        return len(self.low)
-
-
-def plot_run(directory: Path, every: int = 1) -> list[Path]:
+def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list[Path]:
     """Draw ``pictures/history.png`` and ``pictures/NNNNNN.png`` for every K-th output time, and return them.
 
     Colours and frames mean the same in all of them. Not collective.
+
+    Parameters
+    ----------
+    directory : Path
+        The run's.
+    every : int
+        Draw every so many output times.
+    colour : str, optional
+        What is coloured: smoke, speed, pressure or displacement; by default the first of these that varies.
 
     Raises
     ------
@@ -93,10 +64,9 @@ def plot_run(directory: Path, every: int = 1) -> list[Path]:
         drawn.append(_save(_history_figure(read_history(history)), pictures / "history.png"))
     if frames:
         try:
-            stage = _stage(directory, frames)
-            for frame in map(_read, frames):
-                figure = _plane_figure(stage, frame) if stage.dim == 2 else _space_figure(stage, frame)
-                drawn.append(_save(figure, pictures / f"{frame.step:06d}.png"))
+            stage = look_through(directory, frames, colour)
+            for frame in map(read_frame, frames):
+                drawn.append(_save(scene_figure(stage, frame), pictures / f"{frame.step:06d}.png"))
         except (OSError, KeyError) as error:
             raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
     return drawn
@@ -138,81 +108,15 @@ def _history_figure(table: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-# ---- reading ------------------------------------------------------------------------------------------------
-
-
-def _read(path: Path) -> _Frame:
-    with h5py.File(path, "r") as file:
-        fluid = {}
-        for name, array in file.get("fluid", {}).items():
-            data = array[()]
-            dim = data.ndim - (name == "velocity")
-            fluid[name] = data.transpose([*reversed(range(dim)), *range(dim, data.ndim)])
-        solid = file.get("solid")
-        points = solid["points"][()] if solid else None
-        displacement = solid["displacement"][()] if solid else None
-        return _Frame(int(file.attrs["step"]), float(file.attrs["time"]), fluid, points, displacement)
-
-
-def _stage(directory: Path, paths: Sequence[Path]) -> _Stage:
-    """Look through all files once, so that colours and frames mean the same in all pictures."""
-    with h5py.File(directory / "fields" / "mesh.h5", "r") as file:
-        grid = (
-            GridInfo(*(json.loads(file.attrs[k]) for k in ("origin", "spacing", "cells"))) if "grid" in file else None
-        )
-        cells = file["solid/cells"][()] if "solid" in file else np.empty((0, 3), dtype=np.int32)
-        body = file["solid/body"][()] if "solid" in file else np.empty(0, dtype=np.int32)
-    names = ("smoke", "speed", "pressure") if grid else ("displacement",)
-    ranges: dict[str, list[tuple[float, float]]] = {}
-    boxes = []
-    for frame in map(_read, paths):
-        for name in names:
-            values = _values(frame, name)
-            if values is not None and np.isfinite(values).any():
-                ranges.setdefault(name, []).append((float(np.nanmin(values)), float(np.nanmax(values))))
-        if frame.points is not None:
-            boxes.append((frame.points.min(axis=0), frame.points.max(axis=0)))
-    if grid:
-        low = np.array(grid.origin)
-        high = low + np.array(grid.spacing) * grid.cells
-    else:
-        low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-        margin = 0.06 * np.max(high - low)
-        low, high = low - margin, high + margin
-    shown, norm = _choose(ranges)
-    return _Stage(grid, cells, body, low, high, shown, norm)
-
-
-def _choose(ranges: dict[str, list[tuple[float, float]]]) -> tuple[str, Normalize]:
-    """Return the first quantity that varies, in space or time, and its colour scale."""
-    shown, low, high = "pressure", 0.0, 0.0
-    for name, extremes in sorted(ranges.items(), key=lambda item: list(_SHOWN).index(item[0])):
-        shown, low, high = name, min(e[0] for e in extremes), max(e[1] for e in extremes)
-        if high - low > max(_SHOWN[name][2], 1e-9 * abs(high)):
-            break
-    if shown != "pressure":
-        low = min(low, 0.0)
-    return shown, Normalize(low, high if high > low else low + 1.0)
-
-
-def _values(frame: _Frame, name: str) -> np.ndarray | None:
-    """Return a quantity: NaN where a cell holds no fluid, None where there is no such thing."""
-    if name == "displacement":
-        return None if frame.displacement is None else np.linalg.norm(frame.displacement, axis=1)
-    if name == "speed":
-        values = np.linalg.norm(frame.fluid["velocity"], axis=-1) if "velocity" in frame.fluid else None
-    else:
-        values = frame.fluid.get(name)
-    if values is None:
-        return None
-    kind = frame.fluid.get("kind", np.zeros(values.shape, dtype=np.uint8))
-    return np.where(kind == FLUID, values, np.nan)
-
-
 # ---- drawing ------------------------------------------------------------------------------------------------
 
 
-def _plane_figure(stage: _Stage, frame: _Frame) -> Figure:
+def scene_figure(stage: Stage, frame: Frame) -> Figure:
+    """Return the picture of one output time."""
+    return _plane_figure(stage, frame) if stage.dim == 2 else _space_figure(stage, frame)
+
+
+def _plane_figure(stage: Stage, frame: Frame) -> Figure:
     """Return the picture of a 2D scene."""
     extent = stage.high - stage.low
     scale = min(9.0 / extent[0], 7.5 / extent[1])
@@ -220,28 +124,29 @@ def _plane_figure(stage: _Stage, frame: _Frame) -> Figure:
         figsize=(max(3.6, extent[0] * scale + 1.9), max(2.6, extent[1] * scale + 1.0)), layout="constrained"
     )
     ax = figure.subplots()
-    mappable = _draw_cells(ax, stage, frame, (0, 1), None) if stage.grid else None
+    mappable = _draw_fluid(ax, stage, frame, (0, 1), None)
     if frame.points is not None:
-        if stage.grid:
+        if mappable:
             many = len(stage.cells) * 3 >= _MANY_EDGES
             _draw_polygons(ax, list(frame.points[stage.cells]), _body_colours(stage), many)
         else:
-            style: dict[str, Any] = {"shading": "gouraud", "cmap": _SHOWN[stage.shown][1], "norm": stage.norm}
+            style: dict[str, Any] = {"shading": "gouraud", "cmap": SHOWN[stage.shown][1], "norm": stage.norm}
             x, y = frame.points.T
-            mappable = ax.tripcolor(x, y, np.asarray(_values(frame, stage.shown)), triangles=stage.cells, **style)
+            mappable = ax.tripcolor(x, y, np.asarray(quantity(frame, stage.shown)), triangles=stage.cells, **style)
         border = boundary_facets(frame.points, stage.cells)
-        ax.add_collection(LineCollection(list(frame.points[border]), colors=_LINE, lw=1.1))
+        ax.add_collection(LineCollection(list(frame.points[border]), colors=LINE, lw=1.1))
     _finish(ax, stage, (0, 1))
     ax.set_title(f"t = {frame.time:.4g} s", fontsize="medium")
     if mappable:
-        figure.colorbar(mappable, ax=ax, label=_SHOWN[stage.shown][0], aspect=30, shrink=0.9)
+        bar: dict[str, Any] = {"label": SHOWN[stage.shown][0], "extend": stage.extend}
+        figure.colorbar(mappable, ax=ax, aspect=30, shrink=0.9, **bar)
     return figure
 
 
-def _space_figure(stage: _Stage, frame: _Frame) -> Figure:
-    """Return the picture of a 3D scene: two slices through the middle of the solids or the grid, and a view."""
+def _space_figure(stage: Stage, frame: Frame) -> Figure:
+    """Return the picture of a 3D scene: two slices through the middle of the solids or the fluid, and a view."""
     extent = stage.high - stage.low
-    middle = 0.5 * (stage.low + stage.high)
+    middle = stage.middle
     if frame.points is not None:
         middle = np.clip(frame.points.mean(axis=0), stage.low, stage.high)
     n_panels = 2 if frame.points is None else 3
@@ -252,8 +157,7 @@ def _space_figure(stage: _Stage, frame: _Frame) -> Figure:
     for place, across, axis in ((places[0, 0], (0, 1), 2), (places[0, 1], (0, 2), 1)):
         ax = figure.add_subplot(place)
         panels.append(ax)
-        if stage.grid:
-            mappable = _draw_cells(ax, stage, frame, across, middle[axis])
+        mappable = _draw_fluid(ax, stage, frame, across, middle[axis])
         if frame.points is not None:
             polygons, owners = cut_tetrahedra(frame.points, stage.cells, axis, middle[axis])
             _draw_polygons(ax, polygons, _body_colours(stage)[owners], len(polygons) * 3 >= _MANY_EDGES)
@@ -262,15 +166,48 @@ def _space_figure(stage: _Stage, frame: _Frame) -> Figure:
     if frame.points is not None:
         _draw_surface(figure.add_subplot(places[0, 2], projection="3d"), stage, frame.points)
     if mappable:
-        figure.colorbar(mappable, ax=panels, label=_SHOWN[stage.shown][0], shrink=0.6, location="bottom", aspect=50)
+        bar: dict[str, Any] = {"label": SHOWN[stage.shown][0], "extend": stage.extend}
+        figure.colorbar(mappable, ax=panels, shrink=0.6, location="bottom", aspect=50, **bar)
     return figure
 
 
+def _draw_fluid(
+    ax: Axes, stage: Stage, frame: Frame, across: tuple[int, int], at: float | None
+) -> ScalarMappable | None:
+    """Draw the grid or the particles, and what is rigid, in the plane at ``at``; return what a colour bar needs."""
+    if stage.grid:
+        return _draw_cells(ax, stage, frame, across, at)
+    if stage.around:
+        draw_obstacles(ax, stage.around, across, at)
+        draw_sides(ax, stage.around, across)
+    return _draw_particles(ax, stage, frame, across, at) if frame.particles else None
+
+
+def _draw_particles(
+    ax: Axes, stage: Stage, frame: Frame, across: tuple[int, int], at: float | None
+) -> ScalarMappable | None:
+    """Draw the particles as disks as wide as they are apart; of space those less than that away from the plane."""
+    x, colours = frame.particles["points"], quantity(frame, stage.shown)
+    if colours is None:
+        return None
+    if at is not None:
+        distance = np.abs(x[:, 3 - sum(across)] - at)
+        near = np.argsort(-distance, kind="stable")  # the nearest on top
+        near = near[distance[near] <= stage.spacing]
+        x, colours = x[near], colours[near]
+    style: dict[str, Any] = {"cmap": SHOWN[stage.shown][1], "norm": stage.norm, "linewidths": 0.0}
+    size = [stage.spacing]
+    places: dict[str, Any] = {"units": "xy", "offsets": x[:, list(across)], "offset_transform": ax.transData}
+    disks = EllipseCollection(size, size, [0.0], array=colours, **places, **style)
+    ax.add_collection(disks, autolim=False)
+    return disks
+
+
 def _draw_cells(
-    ax: Axes, stage: _Stage, frame: _Frame, across: tuple[int, int], at: float | None
+    ax: Axes, stage: Stage, frame: Frame, across: tuple[int, int], at: float | None
 ) -> ScalarMappable | None:
     """Draw the cells of the plane at ``at``, rigid things in grey; return what a colour bar needs."""
-    values, kind, flow = _values(frame, stage.shown), frame.fluid.get("kind"), frame.fluid.get("velocity")
+    values, kind, flow = quantity(frame, stage.shown), frame.fluid.get("kind"), frame.fluid.get("velocity")
     if at is not None and stage.grid:
         axis = 3 - sum(across)
         index = int(np.clip((at - stage.low[axis]) / stage.grid.spacing[axis], 0, stage.grid.cells[axis] - 1))
@@ -284,16 +221,16 @@ def _draw_cells(
     a, b = across
     extent = (stage.low[a], stage.high[a], stage.low[b], stage.high[b])
     style: dict[str, Any] = {"origin": "lower", "extent": extent, "aspect": "equal", "interpolation": "nearest"}
-    image = ax.imshow(values.T, cmap=_SHOWN[stage.shown][1], norm=stage.norm, **style)
+    image = ax.imshow(values.T, cmap=SHOWN[stage.shown][1], norm=stage.norm, **style)
     if kind is not None:
         rigid = np.where((kind == OBSTACLE) | (kind == OUTSIDE), 1.0, np.nan)
-        ax.imshow(rigid.T, cmap=ListedColormap([_GREY]), **style)
+        ax.imshow(rigid.T, cmap=ListedColormap([GREY]), **style)
         if flow is not None and stage.shown == "speed":
             _draw_arrows(ax, stage, np.where((kind == FLUID)[..., None], flow, np.nan)[..., list(across)], across)
     return image
 
 
-def _draw_arrows(ax: Axes, stage: _Stage, flow: np.ndarray, across: tuple[int, int]) -> None:
+def _draw_arrows(ax: Axes, stage: Stage, flow: np.ndarray, across: tuple[int, int]) -> None:
     """Draw the velocity in a plane by some arrows, as long as their spacing where the flow is fastest."""
     every = max(1, max(flow.shape[:2]) // _ARROWS)
     sides = [
@@ -315,10 +252,10 @@ def _draw_arrows(ax: Axes, stage: _Stage, flow: np.ndarray, across: tuple[int, i
 
 def _draw_polygons(ax: Axes, polygons: list[np.ndarray], colours: np.ndarray, many: bool) -> None:
     # an edge in the colour of the face closes the hairlines between neighbours
-    ax.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours if many else _LINE, lw=0.3))
+    ax.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours if many else LINE, lw=0.3))
 
 
-def _draw_surface(ax: Axes3D, stage: _Stage, points: np.ndarray) -> None:
+def _draw_surface(ax: Axes3D, stage: Stage, points: np.ndarray) -> None:
     """Draw the solids' surface, shaded, in the box of the grid; y points up, as gravity does in most scenes."""
     body_of_node = np.zeros(len(points), dtype=np.int64)
     body_of_node[stage.cells] = stage.body[:, None]
@@ -341,15 +278,15 @@ def _draw_surface(ax: Axes3D, stage: _Stage, points: np.ndarray) -> None:
         axis.set_major_locator(MaxNLocator(4))
 
 
-def _body_colours(stage: _Stage) -> np.ndarray:
+def _body_colours(stage: Stage) -> np.ndarray:
     return _palette(stage.body)
 
 
 def _palette(body: np.ndarray) -> np.ndarray:
-    return np.array([to_rgb(colour) for colour in _BODIES])[body % len(_BODIES)]
+    return np.array([to_rgb(colour) for colour in BODIES])[body % len(BODIES)]
 
 
-def _finish(ax: Axes, stage: _Stage, across: tuple[int, int]) -> None:
+def _finish(ax: Axes, stage: Stage, across: tuple[int, int]) -> None:
     a, b = across
     ax.set(xlim=(stage.low[a], stage.high[a]), ylim=(stage.low[b], stage.high[b]), aspect="equal")
     ax.set(xlabel=f"{'xyz'[a]}, m", ylabel=f"{'xyz'[b]}, m")

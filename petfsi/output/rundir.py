@@ -20,11 +20,12 @@ from petfsi.ranks import on_root
 MARKER = ".petfsi-run"
 #: Set aside while a run is under way, so that a full disk still takes its last words (bytes).
 RESERVE, RESERVE_BYTES = ".reserve", 16384
-_FILES = ".reserve scene.toml options.opts history.csv summary.json log.txt fields.xdmf solid.xdmf fluid.xdmf".split()
+_FILES = ".reserve scene.toml options.opts history.csv summary.json log.txt".split()
+_FILES += "fields.xdmf solid.xdmf fluid.xdmf particles.xdmf".split()
 _DIRECTORIES = {
     "fields": re.compile(r"(\d{6,}|mesh)\.h5(\.part)?"),
     "checkpoint": re.compile(r"\d{6,}\.(h5|json)(\.part)?"),
-    "pictures": re.compile(r"(\d{6,}|history)\.png"),
+    "pictures": re.compile(r"(\d{6,}|history)\.png|film\.gif(\.part)?"),
 }
 
 

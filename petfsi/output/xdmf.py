@@ -1,8 +1,11 @@
 """XDMF: the small XML files through which ParaView and meshio find their way in the HDF5 files.
 
-``fields.xdmf`` is for ParaView: at every time the grid and the deformed solid side by side. ``fluid.xdmf`` and
-``solid.xdmf`` are series on one mesh that never moves, as ``meshio.xdmf.TimeSeriesReader`` wants them; the solid's
-displacement is a point data there. ParaView opens those too.
+``fields.xdmf`` is for ParaView: at every time the grid or the particles, and the deformed solid, side by side.
+``fluid.xdmf`` and ``solid.xdmf`` are series on one mesh that never moves, as ``meshio.xdmf.TimeSeriesReader`` wants
+them; the solid's displacement is a point data there. ``particles.xdmf`` is a series of point clouds: every time has its
+own points, and as many as there are then. ``TimeSeriesReader`` reads the points of the first time unless told, by
+``reader.mesh_grid = reader.collection[k]``, which. ParaView opens those too; where a cloud is empty its reader says
+that it found no data, and shows none.
 """
 
 from __future__ import annotations
@@ -27,6 +30,9 @@ _TOPOLOGY = {
     ("grid", 4): "Quadrilateral",
     ("grid", 8): "Hexahedron",
 }
+#: The index that a run has from the first output time with particles on.
+CLOUDS = "particles.xdmf"
+_CLOUD = "particles/points"
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ def indexes(mesh: str, static: Arrays, entries: Iterable[Entry], grid: GridInfo 
         files["solid.xdmf"] = _document(
             _timed(_solid(mesh, static, entry, (mesh, "solid/reference", static)), entry) for entry in entries
         )
+    with_particles = [entry for entry in entries if _CLOUD in entry.arrays]
+    if with_particles:
+        files[CLOUDS] = _document(_timed(_particles(entry), entry) for entry in with_particles)
     return files
 
 
@@ -89,6 +98,8 @@ def _both(mesh: str, static: Arrays, entry: Entry, grid: GridInfo | None) -> Ele
         scene.append(_flat_grid(mesh, static, entry) if len(grid.cells) == 2 else _regular_grid(grid, entry))
     if "solid/points" in entry.arrays:
         scene.append(_solid(mesh, static, entry, (entry.file, "solid/points", entry.arrays)))
+    if _CLOUD in entry.arrays and entry.arrays[_CLOUD][0][0] > 0:  # VTK's reader complains of a cloud of no points
+        scene.append(_particles(entry))
     return scene
 
 
@@ -131,6 +142,24 @@ def _solid(mesh: str, static: Arrays, entry: Entry, points: tuple[str, str, Arra
     return element
 
 
+def _particles(entry: Entry) -> ElementTree.Element:
+    """Return the particles of one time as a cloud of points; it may be empty."""
+    file, arrays = entry.file, entry.arrays
+    element = ElementTree.Element("Grid", Name="particles", GridType="Uniform")
+    n, dim = arrays[_CLOUD][0]
+    about = {"TopologyType": "Polyvertex", "NumberOfElements": str(n), "NodesPerElement": "1"}
+    _data(ElementTree.SubElement(element, "Topology", about), file, "particles/vertices", arrays)
+    _data(ElementTree.SubElement(element, "Geometry", GeometryType=_geometry(dim)), file, _CLOUD, arrays)
+    for name in _names(arrays, "particles/"):
+        if name not in ("points", "vertices"):
+            _attribute(element, name, "Node", 1, file, f"particles/{name}", arrays)
+    return element
+
+
+def _geometry(dim: int) -> str:
+    return "XY" if dim == 2 else "XYZ"
+
+
 def _unstructured(
     name: str, group: str, mesh: str, static: Arrays, points: tuple[str, str, Arrays]
 ) -> ElementTree.Element:
@@ -140,7 +169,7 @@ def _unstructured(
     topology = ElementTree.SubElement(element, "Topology", TopologyType=kind, NumberOfElements=str(n))
     _data(topology, mesh, f"{group}/cells", static)
     file, path, arrays = points
-    geometry = ElementTree.SubElement(element, "Geometry", GeometryType="XY" if arrays[path][0][1] == 2 else "XYZ")
+    geometry = ElementTree.SubElement(element, "Geometry", GeometryType=_geometry(arrays[path][0][1]))
     _data(geometry, file, path, arrays)
     return element
 

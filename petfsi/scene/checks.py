@@ -14,19 +14,22 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
+from petfsi.scene.fluids import Fluid, InflowSide
 from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Fluid, Halfspace, InflowSide, Probe, Scene, Solid
+from petfsi.scene.particle_checks import particles
+from petfsi.scene.probe_checks import probes
+from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.shape_checks import (
     NO_Z,
     OPPOSITE,
-    SLACK,
     Problems,
     analytic_shape,
     extent,
     images,
     is_measured,
     length,
+    outside_grid,
     overlap,
     periods,
     plain_shape,
@@ -34,10 +37,10 @@ from petfsi.scene.shape_checks import (
     solid_shape,
 )
 from petfsi.scene.stepping import Stepping
+from petfsi.scene.tables import Halfspace
 
 MAX_STEPS = 10**8
 
-SOLID_QUANTITIES = ("displacement", "velocity")
 #: Columns of history.csv, which a probe must not repeat.
 RESERVED_PROBES = (
     "step", "time", "dt", "iterations", "residual", "newton", "substeps", "volume_error", "divergence",
@@ -58,7 +61,7 @@ def check_inside_grid(scene: Scene, key: str, points: np.ndarray) -> None:
     """
     if scene.fluid is None:
         return
-    for problem in _outside_grid(scene.fluid, key, points.min(axis=0).tolist(), points.max(axis=0).tolist()):
+    for problem in outside_grid(scene.fluid, key, points.min(axis=0).tolist(), points.max(axis=0).tolist()):
         raise InputError(str(problem))
 
 
@@ -92,6 +95,10 @@ def _time(scene: Scene) -> Problems:
     except ExpressionError as error:
         yield Problem("time.dt", time.dt, error.reason, ("time.end",))
         return
+    explicit = time.integrator == "symplectic-euler" or (scene.fluid is not None and scene.fluid.kind == "sph")
+    if stepping.auto and not explicit:
+        allowed = "is the stable step of what is explicit, particles or symplectic-euler; give a length (s)"
+        yield Problem("time.dt", time.dt, allowed, ("time.integrator", "fluid.kind"))
     if dt > time.end:
         yield Problem("time.dt", time.dt, f"must not exceed time.end = {time.end:g} s", ("time.end",))
     elif stepping.constant and not time.end / dt <= MAX_STEPS:
@@ -205,7 +212,7 @@ def _solids(scene: Scene) -> Problems:
             yield from beam_shape(f"{key}.shape.beam", beam, scene.dim)
         reach = corners(beam) if beam and is_sound(beam, scene.dim) else extent(solid.shape, scene.dim)
         if scene.fluid is not None and reach is not None:
-            yield from _outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *reach)
+            yield from outside_grid(scene.fluid, f"{key}.shape.{solid.shape.kinds[0]}", *reach)
     yield from _overlaps(scene)
     yield from beams(scene)
 
@@ -237,30 +244,6 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
             yield Problem(f"{here}.displacement.{axis}", support.displacement[axis], allowed, (f"{here}.velocity",))
 
 
-def _outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
-    """Yield a problem if a bounding box does not lie in the grid, but for what reaches through an open side.
-
-    Along a periodic axis every place is in the grid, and what is longer than the grid is not.
-    """
-    if not is_measured(fluid, len(low)):
-        return
-    repeats = periods(fluid, len(low)) > 0.0
-    for n, (axis, a, b, start, size, sides) in enumerate(
-        zip("xyz", low, high, fluid.origin, fluid.size, OPPOSITE, strict=False)
-    ):
-        end, slack = start + size, SLACK * size
-        if repeats[n]:
-            if b - a > size + slack:
-                allowed = f"{axis} must be no longer than the grid, {size:g} m, after which the scene repeats"
-                yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.size", "fluid.sides"))
-            continue
-        # floats: a part of it at least must be in the grid
-        through = [getattr(fluid.sides, side) == "open" and a < end and b > start for side in sides]
-        if (a < start - slack and not through[0]) or (b > end + slack and not through[1]):
-            allowed = f"{axis} must lie inside the fluid's grid, {start:g} to {end:g} m"
-            yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.origin", "fluid.size"))
-
-
 def _overlaps(scene: Scene) -> Problems:
     """Refuse boxes and balls that share material: no body may start inside another."""
     whole = [
@@ -276,40 +259,6 @@ def _overlaps(scene: Scene) -> Problems:
         if any(overlap(a, b, scene.dim, shift) for shift in moves):
             allowed = f"overlaps solids.{first}; bodies must lie apart"
             yield Problem(f"solids.{second}.shape.{b.kinds[0]}", ABSENT, allowed, (f"solids.{first}.shape",))
-
-
-# ---- probes -------------------------------------------------------------------------------------------------
-
-
-def _probes(scene: Scene) -> Problems:
-    for name, probe in scene.probes.items():
-        key = f"probes.{name}"
-        yield from length(f"{key}.at", probe.at, scene.dim)
-        if probe.of == "fluid":
-            yield from _fluid_probe(scene, key, probe)
-        elif probe.of not in scene.solids:
-            known = ", ".join([*(["fluid"] if scene.fluid else []), *scene.solids]) or "fluid, or a solid's name"
-            yield Problem(f"{key}.of", probe.of, f"must be one of {known}", (f"solids.{probe.of}",))
-        elif probe.quantity == "angle" and scene.solids[probe.of].shape.beam is None:
-            yield Problem(f"{key}.quantity", probe.quantity, "only a beam has an angle", (f"{key}.of",))
-        elif probe.quantity not in (*SOLID_QUANTITIES, "angle"):
-            allowed = f"a solid has {' and '.join(SOLID_QUANTITIES)}, a beam an angle, too"
-            yield Problem(f"{key}.quantity", probe.quantity, allowed, (f"{key}.of",))
-
-
-def _fluid_probe(scene: Scene, key: str, probe: Probe) -> Problems:
-    fluid = scene.fluid
-    if fluid is None:
-        yield Problem(f"{key}.of", "fluid", f"the scene has no [fluid], only {', '.join(scene.solids)}", ("fluid",))
-        return
-    if probe.quantity in ("displacement", "angle"):
-        yield Problem(f"{key}.quantity", probe.quantity, "a fluid has velocity, pressure and smoke", (f"{key}.of",))
-    if probe.quantity == "smoke" and fluid.smoke is None:
-        yield Problem(f"{key}.quantity", "smoke", "the fluid has no [fluid.smoke]", (f"{key}.of", "fluid.smoke"))
-    if len(probe.at) == scene.dim:
-        for problem in _outside_grid(fluid, f"{key}.at", probe.at, probe.at):
-            yield Problem(problem.key, probe.at, problem.allowed, (*problem.uses, f"{key}.of"))
-            break
 
 
 # ---- expressions --------------------------------------------------------------------------------------------
@@ -364,9 +313,10 @@ CHECKS: tuple[Callable[[Scene], Problems], ...] = (
     _static,
     _fluid,
     _sides,
+    particles,
     _solids,
     _obstacles,
     _mesh_files,
-    _probes,
+    probes,
     _expressions,
 )

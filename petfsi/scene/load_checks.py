@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Load, Shape, Solid, Tagged
+from petfsi.scene.schema import Load, Solid, Tagged
 from petfsi.scene.shape_checks import NO_Z, OPPOSITE, Problems, analytic_shape, length
+from petfsi.scene.tables import Shape
 
 
 def place(key: str, where: str | Shape | Tagged | None, shape_key: str, shape: Shape, dim: int) -> Problems:

@@ -64,8 +64,8 @@ def shorten(value: Any) -> str:
 
 def describe(entry: Mapping[str, Any]) -> Problem:
     """Return pydantic's finding as a problem."""
-    loc = [part for part in entry["loc"] if not str(part).startswith(("<", "["))]
-    key = ".".join(str(part) for part in loc)
+    loc = [part for part in entry["loc"] if not str(part).startswith("[")]
+    key = ".".join(str(part) for part in loc if not _is_form(part))
     field = _field(loc)
     value = ABSENT if entry["type"] == "missing" or entry["loc"][-1] == "[key]" else entry["input"]
     if entry["type"] == "extra_forbidden":
@@ -111,10 +111,19 @@ def _allowed(entry: Mapping[str, Any]) -> str:
     return entry["msg"]
 
 
+def _is_form(part: Any) -> bool:
+    """Whether a part of a path tells which form of a table is meant, and is no key."""
+    return str(part).startswith("<")
+
+
 def _unknown(loc: list[Any]) -> str:
     """Say that there is no such setting, and which one may be meant: beside it, or else in another table."""
     name, table = str(loc[-1]), _model(loc[:-1])
     fields = table.model_fields if table is not None else {}
+    others = _walk([part for part in loc[:-1] if not _is_form(part)])[0]
+    having = [kind.form.strip("<>") for kind in others if hasattr(kind, "form") and name in kind.model_fields]
+    if having:
+        return f"belongs to kind = {' and '.join(having)}; known here are {', '.join(fields)}"
     near = difflib.get_close_matches(name, fields, 1)
     if near:
         unit = fields[near[0]].description
@@ -156,6 +165,9 @@ def _walk(loc: list[Any]) -> tuple[list[Any], FieldInfo | None]:
     field: FieldInfo | None = None
     for part in loc:
         following: list[Any] = []
+        if _is_form(part):
+            here = [kind for kind in here if getattr(kind, "form", part) == part]
+            continue
         for kind in here:
             if _is_model(kind) and part in kind.model_fields:
                 field = kind.model_fields[part]

@@ -6,68 +6,19 @@ is its unit or a few words on what is meant, and ends up in error messages.
 
 from __future__ import annotations
 
-import math
-import os
-from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    PrivateAttr,
-    Strict,
-    Tag,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import BeforeValidator, Discriminator, Field, PrivateAttr, Tag, field_validator
 from pydantic_core import PydanticCustomError
 
 from petfsi.integrators import INTEGRATORS
-from petfsi.registry import COUPLINGS, FLUIDS, MATERIALS
+from petfsi.registry import COUPLINGS, MATERIALS
+from petfsi.scene.fluids import Fluid
+from petfsi.scene.tables import Flag, Number, Real, Shape, Table, Vector, Whole, one_of
 
-
-def _number_or_text(value: Any) -> Any:
-    """Refuse what is neither a finite number nor a text, in one message rather than one per type."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise PydanticCustomError("number_or_text", "must be a number or an expression in quotes")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise PydanticCustomError("number_or_text", "must be a finite number")
-    return value
-
-
-def _one_of(names: Collection[str]) -> Callable[[Any], str]:
-    """Return a validator of names that are registered elsewhere, which speaks as those of literals do."""
-    quoted = [f"'{name}'" for name in names]
-    expected = " or ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
-
-    def known(value: Any) -> str:
-        if not isinstance(value, str) or value not in names:
-            raise PydanticCustomError("literal_error", "Input should be {expected}", {"expected": expected})
-        return value
-
-    return known
-
-
-#: TOML has types, so a text is no number, and neither is true.
-Real = Annotated[float, Strict()]
-Whole = Annotated[int, Strict()]
-Flag = Annotated[bool, Strict()]
-Vector = list[Real]
-Cells = list[Annotated[Whole, Field(ge=1)]]
-#: A number, or an expression of x, y, z, t and pi (see ``expressions.py``).
-Number = Annotated[float | str, BeforeValidator(_number_or_text)]
 Component = Literal["x", "y", "z", "angle"]
 Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
-
-
-class Table(BaseModel):
-    """A table of the scene."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Time(Table):
@@ -75,7 +26,7 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Number, Field(description="s")]
-    integrator: Annotated[str, BeforeValidator(_one_of(INTEGRATORS))] = "newmark"
+    integrator: Annotated[str, BeforeValidator(one_of(INTEGRATORS))] = "newmark"
     above_limit: Annotated[
         Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
     ] = "refuse"
@@ -87,157 +38,6 @@ class Time(Table):
         if not isinstance(dt, str) and dt <= 0:
             raise PydanticCustomError("greater_than", "must be greater than 0", {"gt": 0})
         return dt
-
-
-# ---- shapes -------------------------------------------------------------------------------------------------
-
-
-class Box(Table):
-    """An axis-parallel box; with ``cells`` it can be meshed."""
-
-    origin: Annotated[Vector, Field(description="m")]
-    size: Annotated[Vector, Field(description="m")]
-    cells: Cells | None = None
-
-
-class Ball(Table):
-    """A disk (2D) or ball (3D); with ``cells``, how many it has across, it can be meshed."""
-
-    centre: Annotated[Vector, Field(description="m")]
-    radius: Annotated[Real, Field(gt=0, description="m")]
-    cells: Annotated[Annotated[Whole, Field(ge=2, multiple_of=2)] | None, Field(description="cells across")] = None
-
-
-class Cylinder(Table):
-    """A finite round cylinder between two points (3D only)."""
-
-    start: Annotated[Vector, Field(description="m")]
-    end: Annotated[Vector, Field(description="m")]
-    radius: Annotated[Real, Field(gt=0, description="m")]
-
-
-class Halfspace(Table):
-    """All points behind a plane: (x - point) . normal <= 0."""
-
-    point: Annotated[Vector, Field(description="m")]
-    normal: Vector
-
-
-class Beam(Table):
-    """A straight beam between two points (2D only), its faces half a thickness on either side."""
-
-    start: Annotated[Vector, Field(description="m")]
-    end: Annotated[Vector, Field(description="m")]
-    thickness: Annotated[Real, Field(gt=0, description="m")]
-    elements: Annotated[Whole, Field(ge=1, description="along the beam")]
-    theory: Literal["timoshenko", "euler-bernoulli"] = "timoshenko"
-
-
-class Shape(Table):
-    """Exactly one of the shapes; ``mesh`` is a file that meshio reads, relative to the scene."""
-
-    box: Box | None = None
-    ball: Ball | None = None
-    cylinder: Cylinder | None = None
-    halfspace: Halfspace | None = None
-    beam: Beam | None = None
-    mesh: Annotated[str | None, Field(description="a file that meshio reads")] = None
-    scale: Annotated[Real, Field(gt=0, description="factor on a mesh file's coordinates")] = 1.0
-    translate: Annotated[Vector | None, Field(description="m, applied to a mesh file after scaling")] = None
-    cavity: Annotated[Box | None, Field(description="cells of a meshed box with their centre in it are left out")] = (
-        None
-    )
-
-    @field_validator("mesh")
-    @classmethod
-    def _absolute(cls, mesh: str | None, info: ValidationInfo) -> str | None:
-        """Resolve a mesh path against the scene's directory, so that the run directory's copy still finds it."""
-        if mesh and info.context:
-            return os.path.abspath(Path(info.context["directory"], Path(mesh).expanduser()))
-        return mesh
-
-    @property
-    def kinds(self) -> list[str]:
-        """Which shapes are given; a valid shape names one."""
-        kinds = ("box", "ball", "cylinder", "halfspace", "beam", "mesh")
-        return [kind for kind in kinds if getattr(self, kind) is not None]
-
-
-# ---- fluid --------------------------------------------------------------------------------------------------
-
-
-class Inflow(Table):
-    """A jet through (part of) a side."""
-
-    speed: Annotated[Number, Field(description="m/s into the domain; may depend on x, y, z, t")]
-    region: Annotated[Shape | None, Field(description="the part of the side in this shape, or all of it")] = None
-    ramp: Annotated[Real, Field(ge=0, description="s over which the speed grows smoothly from zero")] = 0.0
-    smoke: Annotated[Real, Field(ge=0, description="smoke carried in")] = 0.0
-    rest: Annotated[Literal["slip", "open"], Field(description="what the remainder of the side is")] = "slip"
-
-
-class InflowSide(Table):
-    """The table form of a side."""
-
-    inflow: Inflow
-
-
-def _side_form(value: Any) -> str:
-    """Tell the two forms of a side apart by their type, so that errors speak of one form only."""
-    return "<table>" if isinstance(value, dict | InflowSide) else "<name>"
-
-
-Side = Annotated[
-    Annotated[Literal["slip", "open", "periodic"], Tag("<name>")] | Annotated[InflowSide, Tag("<table>")],
-    Discriminator(_side_form),
-    Field(description="or { inflow = { speed = ... } }"),
-]
-
-
-class Sides(Table):
-    """The sides of the grid; left/right bound x, bottom/top y, back/front z (3D only)."""
-
-    left: Side = "slip"
-    right: Side = "slip"
-    bottom: Side = "slip"
-    top: Side = "slip"
-    back: Side = "slip"
-    front: Side = "slip"
-
-
-class Smoke(Table):
-    """A scalar carried along with the fluid."""
-
-    initial: Annotated[Number, Field(description="may depend on x, y, z")] = 0.0
-    buoyancy: Annotated[Real, Field(description="acceleration against gravity per unit of smoke, over gravity")] = 0.0
-
-
-class FluidInitial(Table):
-    """The fluid at time zero."""
-
-    velocity: Annotated[list[Number] | None, Field(description="m/s; may depend on x, y, z")] = None
-
-
-class Fluid(Table):
-    """An incompressible fluid on a regular staggered grid."""
-
-    kind: Annotated[str, BeforeValidator(_one_of(FLUIDS))] = "mac"
-    density: Annotated[Real, Field(gt=0, description="kg/m^3")]
-    viscosity: Annotated[Real, Field(description="Pa s")] = 0.0
-    origin: Annotated[Vector, Field(description="m")]
-    size: Annotated[Vector, Field(description="m")]
-    cells: Cells
-    sides: Sides = Sides()
-    advection: Literal["cubic", "linear"] = "cubic"
-    smoke: Smoke | None = None
-    initial: FluidInitial = FluidInitial()
-
-    @field_validator("viscosity")
-    @classmethod
-    def _inviscid(cls, viscosity: float) -> float:
-        if viscosity != 0:
-            raise PydanticCustomError("inviscid", "must be 0: this version solves inviscid fluids")
-        return viscosity
 
 
 # ---- solids -------------------------------------------------------------------------------------------------
@@ -323,7 +123,7 @@ class Solid(Table):
     density: Annotated[Real, Field(gt=0, description="kg/m^3")]
     young: Annotated[Real, Field(gt=0, description="Pa")]
     poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
-    material: Annotated[str, BeforeValidator(_one_of(MATERIALS))] = "green"
+    material: Annotated[str, BeforeValidator(one_of(MATERIALS))] = "green"
     tangent: Annotated[
         Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
     ] = "exact"
@@ -355,7 +155,7 @@ class Obstacle(Table):
 class Coupling(Table):
     """How fluid and solids are joined."""
 
-    transfer: Annotated[str, BeforeValidator(_one_of(COUPLINGS))] = "cutcell"
+    transfer: Annotated[str, BeforeValidator(one_of(COUPLINGS))] = "cutcell"
     #: Facets are split until their pieces are about a cell / quadrature.
     quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
 
@@ -363,9 +163,9 @@ class Coupling(Table):
 class Probe(Table):
     """A quantity written to every row of history.csv."""
 
-    of: Annotated[str, Field(description="a solid's name, or fluid")]
-    at: Annotated[Vector, Field(description="m; in a solid, where the point is at rest")]
-    quantity: Literal["displacement", "velocity", "angle", "pressure", "smoke"]
+    of: Annotated[str, Field(description="a solid's name, fluid, or what a force is on")]
+    at: Annotated[Vector | None, Field(description="m; in a solid, where the point is at rest")] = None
+    quantity: Literal["displacement", "velocity", "angle", "pressure", "smoke", "front", "level", "force"]
 
 
 class Output(Table):

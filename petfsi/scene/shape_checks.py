@@ -8,8 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from petfsi.scene.fluids import Fluid
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Box, Fluid, Shape
+from petfsi.scene.tables import Box, Shape
 
 #: PETSc numbers unknowns with 32 bits.
 MAX_CELLS = 2**31 - 1
@@ -193,3 +194,27 @@ def _core(shape: Shape, dim: int) -> tuple[np.ndarray, np.ndarray]:
     assert corners is not None
     low, high = (np.array(corner) for corner in corners)
     return (low, high) if shape.ball is None else (0.5 * (low + high), 0.5 * (low + high))
+
+
+def outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
+    """Yield a problem if a bounding box does not lie in the grid, but for what reaches through an open side.
+
+    Along a periodic axis every place is in the grid, and what is longer than the grid is not.
+    """
+    if not is_measured(fluid, len(low)):
+        return
+    repeats = periods(fluid, len(low)) > 0.0
+    for n, (axis, a, b, start, size, sides) in enumerate(
+        zip("xyz", low, high, fluid.origin, fluid.size, OPPOSITE, strict=False)
+    ):
+        end, slack = start + size, SLACK * size
+        if repeats[n]:
+            if b - a > size + slack:
+                allowed = f"{axis} must be no longer than the grid, {size:g} m, after which the scene repeats"
+                yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.size", "fluid.sides"))
+            continue
+        # floats: a part of it at least must be in the grid
+        through = [getattr(fluid.sides, side) == "open" and a < end and b > start for side in sides]
+        if (a < start - slack and not through[0]) or (b > end + slack and not through[1]):
+            allowed = f"{axis} must lie inside the fluid's grid, {start:g} to {end:g} m"
+            yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.origin", "fluid.size"))

@@ -11,6 +11,12 @@ from petfsi.scene.schema import Time
 SLACK = 1e-6
 #: The shortest step, over the run's length: shorter ones would be lost in the round-off of the time.
 SHORTEST = 1e-12
+#: The value of ``time.dt`` that leaves the length to the stable step,
+AUTO = "auto"
+#: of which a step is this part: it may shrink meanwhile.
+PART = 0.9
+#: While the stable step is not known: this part of the run.
+UNKNOWN = 1e-6
 
 
 class Stepping:
@@ -21,18 +27,25 @@ class Stepping:
 
     Attributes
     ----------
-    constant : bool
-        Whether all steps have the same length.
+    constant, auto : bool
+        Whether all steps have the same length; whether the stable step gives it.
     """
 
     def __init__(self, time: Time) -> None:
         self.end = time.end
-        self._dt = Expression(time.dt, ("t",), key="time.dt")
-        self.constant = self._dt.is_constant
+        self.auto = time.dt == AUTO
+        self._dt = Expression(UNKNOWN * time.end if self.auto else time.dt, ("t",), key="time.dt")
+        self.constant = self._dt.is_constant and not self.auto
         self._length: float | None = None  # of all steps, once it is known
 
-    def length(self, t: float) -> float:
+    def length(self, t: float, stable: float | None = None) -> float:
         """Return the length of the step that begins at t, s.
+
+        Parameters
+        ----------
+        t : float
+        stable : float, optional
+            The stable step then, s, if it is wanted and known.
 
         Raises
         ------
@@ -41,6 +54,8 @@ class Stepping:
         """
         if self._length is not None:
             return self._length
+        if self.auto and stable is not None:
+            return PART * stable
         dt = float(self._dt(t=t))
         if dt > (0.0 if self.constant else SHORTEST * self.end):
             self._length = dt if self.constant else None
@@ -61,6 +76,8 @@ class Stepping:
     def count(self, most: int) -> int | None:
         """Return how many steps there are; None if they differ and are more than ``most``, or one is impossible."""
         step, t = 0, 0.0
+        if self.auto:
+            return None
         try:
             dt = self.length(t)
             if self.constant:

@@ -16,7 +16,8 @@ from petfsi.geometry.beams import axis_mesh
 from petfsi.geometry.places import located_facets
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Load, Number, Solid
+from petfsi.scene.schema import Load, Solid
+from petfsi.scene.tables import Number
 
 #: Gauss points of an element: exact to degree 5.
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError
-from petfsi.fields.base import FluidField
+from petfsi.fields.base import PressureFluid
 from petfsi.fields.mac import kinds, pressure
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
@@ -18,6 +18,7 @@ from petfsi.fields.mac.sides import Surroundings, periodic_axes
 from petfsi.fields.mac.slivers import outer_products
 from petfsi.petsc import gather_sums, gather_triplets, new_block, set_csr, sum_csr
 from petfsi.ranks import on_root
+from petfsi.scene import fluids
 from petfsi.scene.schema import Scene
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ REPLACED = (
 )  # fmt: skip
 
 
-class CoveredGrid(FluidField):
+class CoveredGrid(PressureFluid):
     """A field with the pressure of every cell of a grid as unknown; which cells and faces are fluid changes with time.
 
     Attributes
@@ -76,9 +77,9 @@ class CoveredGrid(FluidField):
     name = "pressure"
 
     def __init__(self, comm: MPI.Comm, scene: Scene):
-        assert scene.fluid is not None
-        self.scene, self.comm = scene, comm
         fluid = scene.fluid
+        assert isinstance(fluid, fluids.MacFluid)
+        self.scene, self.comm = scene, comm
         periodic = periodic_axes(fluid.sides, scene.dim)
         if any(p and n < 3 for p, n in zip(periodic, fluid.cells, strict=True)):
             raise InputError(f"fluid.cells = {fluid.cells}: a periodic axis needs at least 3 cells")

@@ -21,8 +21,10 @@ from petfsi.fields.mac.sides import evaluate_at, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
 from petfsi.ranks import agreed
+from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Number, Scene
+from petfsi.scene.schema import Scene
+from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.cutgrid import Openings
@@ -58,8 +60,8 @@ class MacFluid(CoveredGrid):
 
     def __init__(self, comm: MPI.Comm, scene: Scene):
         super().__init__(comm, scene)
-        assert scene.fluid is not None
         grid, fluid = self.grid, scene.fluid
+        assert isinstance(fluid, fluids.MacFluid)
         self._transport = TRANSPORTS[scene.time.integrator](Advection(grid, self.surroundings, fluid.advection))
         self.velocity = Faces(grid.zeros_faces(axis) for axis in self._axes)
         self.velocity_star = Faces(grid.zeros_faces(axis) for axis in self._axes)

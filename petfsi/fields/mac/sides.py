@@ -14,8 +14,10 @@ from petfsi.fields.mac.grid import MacGrid
 from petfsi.geometry.shapes import bounds, inside
 from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Inflow, InflowSide, Obstacle, Shape, Side, Sides
+from petfsi.scene.fluids import Inflow, InflowSide, Side, Sides
+from petfsi.scene.schema import Obstacle
 from petfsi.scene.shape_checks import images
+from petfsi.scene.tables import Shape
 
 T = TypeVar("T")
 

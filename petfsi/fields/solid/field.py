@@ -29,8 +29,9 @@ from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, re
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Number, Scene, Solid
+from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
+from petfsi.scene.tables import Number
 
 
 class NodalSolid(SolidField):

@@ -1,0 +1,1 @@
+"""The fluid as particles: weakly compressible smoothed particle hydrodynamics."""

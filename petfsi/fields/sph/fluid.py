@@ -1,0 +1,280 @@
+"""A weakly compressible fluid of particles: smoothed particle hydrodynamics, stepped by kick, drift, kick.
+
+With the law of ``passes`` (D the rate of density, f the forces), h the step and a the acceleration of the step before,
+
+    v' = v + h/2 a        x' = x + h/2 v'        rho += h D(x', v', rho)
+    x = x' + h/2 v' - shift        a = f(x, v', rho)/m + g        v = v' + h/2 a
+
+so each pair is visited twice a step. It is of second order and, without viscosity, diffusion and shifting, symplectic.
+The equations have no unknowns that must be solved for: the field has no block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.errors import SolveError
+from petfsi.fields.base import FluidField, Reader, Slab, Stock, Work
+from petfsi.fields.sph import moves, probes
+from petfsi.fields.sph.balance import bisect
+from petfsi.fields.sph.cells import PairLists, Pairs
+from petfsi.fields.sph.particles import StrayError, Swarm
+from petfsi.fields.sph.passes import FluidRows, Passes
+from petfsi.fields.sph.room import Room
+from petfsi.fields.sph.start import Start, limits
+from petfsi.fields.sph.walls import Walls
+from petfsi.scene.expressions import Expression
+from petfsi.scene.schema import Scene
+
+#: Lists of pairs reach so much farther than particles see: they hold while no two came nearer by as much.
+SKIN = 0.05
+#: What a checkpoint holds besides "id" and "x".
+STORED = ("v", "rho", "m", "a", "S")
+
+
+class SphFluid(FluidField):
+    """Particles with their walls.
+
+    Attributes
+    ----------
+    swarm : Swarm
+        Columns x, v, rho, m, a (acceleration), S (see ``passes``), anchor (where it was when pairs were listed).
+    passes : Passes
+        With the law.
+    walls : Walls or None
+        None where no side and no obstacle holds the fluid.
+    pairs : Pairs
+        Of particles, as last listed.
+    room : Room
+        The box, its sides, and the grid of cells.
+    """
+
+    name = "particles"
+    has_block = False
+    explicit = True
+    elastic = True
+
+    def __init__(self, comm: MPI.Comm, scene: Scene):
+        start = Start(scene)
+        self.comm, self.scene, self.dim = comm, scene, scene.dim
+        self.law, self.room = start.law, Room.of(scene, start.law, SKIN)
+        self.density, self.spacing = start.law.rho0, start.law.spacing
+        self.cell_volume = self.spacing**self.dim
+        self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
+        self.passes, self._lists = Passes(self.law), PairLists()
+        vector = (self.dim, np.float64)
+        columns = {"v": vector, "rho": ((), np.float64), "m": ((), np.float64)}
+        self.swarm = Swarm(comm, self.room.grid, {**columns, "a": vector, "S": vector, "anchor": vector})
+        rows = start.rows(slice(comm.rank, None, comm.size))
+        boxes = bisect(comm, self.room.grid, self.room.grid.of(rows["x"]))
+        self.swarm.insert(rows)
+        self.swarm.rebuild(boxes)
+        dummies = start.dummies()
+        self.walls = Walls(comm, self.room.grid, boxes, dummies) if len(dummies.x) else None
+        self._notes = start.notes
+        self.swarm["a"][:] = self.gravity(0.0)
+        self._forget_step()
+        self._measure_speeds()
+
+    def _forget_step(self) -> None:
+        """Know nothing of a step under way, and of no pairs."""
+        self._listed = self._pushed = self._moving = False
+        self._way, self._diffused, self._dissipated = np.zeros(self.dim), 0.0, 0.0
+
+    def gravity(self, t: float) -> np.ndarray:
+        """Return the acceleration of gravity at a time, shape (dim,), m/s^2."""
+        return np.array([float(g(t=t)) for g in self._gravity]) if self._gravity else np.zeros(self.dim)
+
+    # ---- the step -------------------------------------------------------------------------------------------------
+
+    def predict(self, time: float, dt: float) -> None:
+        """Kick, drift, take the new density, drift, shift: all but the forces at the end. Collective."""
+        swarm, half = self.swarm, dt / 2
+        self._way, self._diffused, self._pushed, self._moving = np.zeros(self.dim), 0.0, False, True
+        moves.kick(swarm["v"], swarm["a"], half)
+        moves.drift(swarm["x"], swarm["v"], half)
+        self._refresh("x", "v", "rho")
+        swarm = self.swarm
+        self._condense(time + half, dt)
+        moves.drift(swarm["x"], swarm["v"], half)
+        mine = swarm.owned
+        self._way += dt * (swarm["m"][mine] @ swarm["v"][mine])
+        if self.room.shifting:
+            columns = swarm["x"], swarm["v"], swarm["S"], swarm["m"], mine
+            shifted = np.zeros(self.dim)
+            moves.shift(*columns, dt, self.law.s, shifted)
+            self._diffused += float(shifted @ self.gravity(time + half))
+            self._way += shifted
+
+    def _condense(self, time: float, dt: float) -> None:
+        """Take the density to the end of the step. Collective."""
+        swarm, mine = self.swarm, self.swarm.owned
+        self._weigh(time)
+        walls = (None, None) if self.walls is None else (self.walls.rows, self.walls.pairs)
+        rates = self.passes.density_rates(self._rows(), self.pairs, *walls)
+        rho = swarm["rho"][mine]
+        power = swarm["m"][mine] * self.law.pressure(rho) / rho**2 @ rates.diffusive[mine]
+        self._diffused -= dt * float(power)
+        swarm["rho"] += dt * rates.total
+
+    def assemble(self, time: float, dt: float) -> None:
+        """Find the forces where the step has brought the particles. Collective; once a step."""
+        if self._pushed:
+            return
+        end = time + dt if self._moving else time
+        self._refresh("x", "rho")
+        self._weigh(end)
+        fluid, walls = self._rows(), self.walls
+        p = self.law.pressure(fluid.rho)
+        if walls is None:
+            forces = self.passes.forces(fluid, p, self.pairs)
+        else:
+            walls.press(self.passes, fluid, p)
+            forces = self.passes.forces(fluid, p, self.pairs, walls.rows, walls.pressure, walls.density, walls.pairs)
+            walls.force = forces.f_wall
+        mine = self.swarm.owned
+        self._dissipated = dt * float(forces.dissipated[mine].sum())
+        self.swarm["S"] = moves.fade(forces.S, forces.full)
+        self.swarm["a"] = forces.f / fluid.m[:, None] + self.gravity(end)
+        self.room.let_go(self.swarm, self.gravity(end), dt)
+        self._pushed = True
+
+    def accept(self, x: np.ndarray, time: float, dt: float) -> None:
+        """Kick for the second half of the step. Collective."""
+        moves.kick(self.swarm["v"], self.swarm["a"], dt / 2)
+        self._moving = False
+        self._measure_speeds()
+
+    def _rows(self) -> FluidRows:
+        swarm = self.swarm
+        return FluidRows(swarm["x"], swarm["v"], swarm["rho"], swarm["m"])
+
+    def _weigh(self, time: float) -> None:
+        """Let pressures balance the gravity of this time."""
+        g = tuple(self.gravity(time).tolist())
+        if g != self.law.gravity:
+            self.law = self.passes.law = replace(self.law, gravity=g)
+
+    def _refresh(self, *names: str) -> None:
+        """Give ghosts these columns anew; list pairs again if particles have come too near each other. Collective.
+
+        Raises
+        ------
+        SolveError
+            On all ranks, where a particle is nowhere, or where none can be.
+        """
+        swarm = self.swarm
+        way = moves.farthest(swarm["x"], swarm["anchor"], swarm.owned) if self._listed else np.inf
+        way = self.comm.allreduce(np.inf if np.isnan(way) else way, MPI.MAX)
+        if 2 * way < SKIN * self.room.reach:
+            swarm.exchange(*names)
+        else:
+            self._list_pairs()
+
+    def _list_pairs(self) -> None:
+        """Sort the particles and list their pairs. Collective."""
+        swarm, reach = self.swarm, (1 + SKIN) * self.room.reach
+        self.room.release(swarm)
+        self.room.check(self.comm, swarm)
+        try:
+            swarm.rebuild(swarm.balanced())
+        except StrayError as error:
+            raise SolveError(f"the particles have blown up: {error}") from None
+        swarm["anchor"][:] = swarm["x"]
+        self.pairs: Pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
+        if self.walls is not None:
+            self.walls.meet(swarm, reach)
+        self._listed = True
+
+    # ---- how long a step may be -----------------------------------------------------------------------------------
+
+    def _measure_speeds(self) -> None:
+        """Find the largest speed and acceleration. Collective."""
+        swarm = self.swarm
+        found = np.array([moves.fastest(swarm[name], swarm.owned) for name in ("v", "a")])
+        found[np.isnan(found)] = np.inf
+        self.comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
+        self._fastest, self._strongest = found.tolist()
+        if not np.isfinite(self._fastest + self._strongest):
+            raise SolveError(
+                "the particles have blown up: a velocity or an acceleration is not a finite number; a shorter time.dt "
+                "or a larger fluid.sound_speed may help"
+            )
+
+    def stable_step(self) -> float:
+        """Return the smallest of the limits on the step, s."""
+        return min(limits(self.law, self._fastest, self._strongest).values())
+
+    # ---- accounts -------------------------------------------------------------------------------------------------
+
+    def stock(self) -> Stock:
+        """Return this rank's share of momentum and energy."""
+        swarm, mine = self.swarm, self.swarm.owned
+        m, v = swarm["m"][mine], swarm["v"][mine]
+        kinetic = 0.5 * float(m @ np.sum(v**2, axis=1))
+        return Stock(m @ v, kinetic, float(m @ self.law.elastic_energy(swarm["rho"][mine])))
+
+    def work(self, dt: float) -> Work:
+        """Return this rank's share of what was done in the step last accepted.
+
+        ``damping`` holds what viscosity and diffusion took, and shifting, as far as it moved weight down.
+        """
+        gravity = float(self._way @ np.array(self.law.gravity))
+        return Work(gravity=gravity, damping=self._dissipated + self._diffused, boundary=-self.room.take_lost())
+
+    # ---- what others see ------------------------------------------------------------------------------------------
+
+    @property
+    def notes(self) -> list[str]:
+        """What was dropped of the fill, and what of the table is unwise."""
+        return self._notes
+
+    def tally(self) -> dict[str, float]:
+        """Return the number of particles. Collective."""
+        return {"particles": float(self.comm.allreduce(self.swarm.n_owned))}
+
+    def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
+        """Return ``pressure`` or ``velocity`` at a point, ``level`` there, or ``front`` of all. Collective."""
+        if quantity == "front":
+            return probes.front(self)
+        if quantity == "level":
+            return probes.level(self, np.array(at))
+        return probes.at_point(self, quantity, np.array(at))
+
+    def force_on(self, wall: str) -> np.ndarray:
+        """Return the force on a side or an obstacle at the end of the step, shape (dim,), N. Collective."""
+        if self.walls is None or wall not in self.walls.names:
+            return np.zeros(self.dim)
+        total = self.comm.allreduce(self.walls.push())
+        return total[self.walls.names.index(wall)]
+
+    def output(self) -> dict[str, Slab]:
+        """Return places, velocity, pressure and density of all particles, by id. Collective."""
+        slabs = self.swarm.slabs(["v", "rho"])
+        rho = slabs["rho"]
+        pressure = Slab(self.law.pressure(rho.data), rho.start, rho.shape)
+        return {
+            "points": slabs["x"],
+            "velocity": slabs["v"],
+            "pressure": pressure,
+            "density": rho,
+            "id": slabs["id"],
+        }
+
+    def forget(self) -> None:
+        """List pairs anew before the next pass, as a run that goes on must. Collective."""
+        self._listed = False
+
+    def state(self) -> dict[str, Slab]:
+        """Return all that the next step reads, by id. Collective."""
+        return self.swarm.slabs(STORED)
+
+    def restore(self, read: Reader) -> None:
+        """Take the state back from a checkpoint, on any number of ranks. Collective."""
+        self.swarm.restore(read, STORED)
+        self._forget_step()
+        self._pushed = True  # a is that of the forces
+        self._measure_speeds()

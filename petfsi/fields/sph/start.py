@@ -1,0 +1,118 @@
+"""A fluid of particles at time zero: where they are, how heavy and how fast, and the law they obey."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from petfsi.errors import InputError
+from petfsi.fields.sph.dummies import Domain, Dummies, wall_dummies
+from petfsi.fields.sph.fill import hydrostatic, liquid
+from petfsi.fields.sph.law import Law
+from petfsi.scene import fluids
+from petfsi.scene.expressions import Expression
+from petfsi.scene.schema import Scene
+from petfsi.scene.shape_checks import OPPOSITE
+
+#: The sound speed is so many times the fastest flow, so that density varies by one in a hundred.
+MACH = 10.0
+#: Parts of the limits on the step: sound, viscosity, forces. The scheme's bounds are 1.2 and, for the second, 0.23.
+ACOUSTIC, VISCOUS, FORCED = 0.9, 0.2, 0.25
+#: With less smoothing the kernel's sums are off by more than a hundredth, and pressures with them.
+SMOOTH = {"wendland": 1.4, "quadratic": 1.2, "cubic": 1.1}
+
+
+class Start:
+    """What a scene says of its particles. Not collective: every rank makes the same of it.
+
+    Attributes
+    ----------
+    law : Law
+    x, v : ndarray, shape (n, dim)
+        m, m/s.
+    rho, m : ndarray, shape (n,)
+        kg/m^3 and kg (per metre in 2D): the mass of a place is that of what fills it under its pressure.
+    notes : list of str
+        What a user should know.
+
+    Raises
+    ------
+    InputError
+        If there is no particle, or nothing says how fast sound must be.
+    """
+
+    def __init__(self, scene: Scene):
+        fluid = scene.fluid
+        assert isinstance(fluid, fluids.SphFluid)
+        self._scene, self._fluid = scene, fluid
+        low = np.array(fluid.origin, dtype=float)
+        sides = tuple((getattr(fluid.sides, a), getattr(fluid.sides, b)) for a, b in OPPOSITE[: scene.dim])
+        self._domain = Domain(low, low + fluid.size, sides)
+        found = liquid(self._domain, fluid.spacing, fluid.fill, scene.obstacles, scene.directory, fitted=True)
+        self.x, self.notes = found.x, list(found.notes)
+        if not len(self.x):
+            raise InputError("fluid.fill: holds no particle; is it outside the box, or inside an obstacle?")
+        self.v = self._velocities()
+        gravity = self._gravity()
+        c = fluid.sound_speed or self._sound_speed(gravity)
+        nu, s = fluid.viscosity / fluid.density, fluid.smoothing * fluid.spacing
+        terms = {"alpha": fluid.alpha, "nu": nu, "delta": fluid.density_diffusion}
+        self.law = Law(scene.dim, fluid.density, c, s, fluid.spacing, fluid.kernel, tuple(gravity.tolist()), **terms)
+        p = np.zeros(len(self.x))
+        if fluid.pressure == "hydrostatic":
+            p = hydrostatic(self.x, gravity, self.law, self._domain.periodic, found.is_solid)
+        self.rho = self.law.density(p)
+        self.m = self.rho * found.volume
+        if fluid.smoothing < SMOOTH[fluid.kernel]:
+            self.notes.append(
+                f"fluid.smoothing = {fluid.smoothing:g}: the {fluid.kernel} kernel's sums err by more than 1% on a "
+                f"lattice below {SMOOTH[fluid.kernel]:g}, and pressures by as much"
+            )
+
+    def _gravity(self) -> np.ndarray:
+        given = self._scene.gravity or [0.0] * self._scene.dim
+        return np.array([float(Expression(g, ("t",), f"gravity.{n}")(t=0.0)) for n, g in enumerate(given)])
+
+    def _velocities(self) -> np.ndarray:
+        given = self._fluid.initial.velocity
+        v = np.zeros_like(self.x)
+        axes = ("x", "y", "z")[: self._scene.dim]
+        for n, source in enumerate(given or []):
+            expression = Expression(source, axes, f"fluid.initial.velocity.{n}")
+            v[:, n] = expression(**dict(zip(axes, self.x.T, strict=True)))
+        return v
+
+    def _sound_speed(self, gravity: np.ndarray) -> float:
+        """Return 10 times the speed of what falls through the liquid's height, or that it has at the start, m/s."""
+        heights = self.x @ gravity
+        fastest = max(float(np.sqrt(2 * np.ptp(heights))), float(np.linalg.norm(self.v, axis=1).max()))
+        if fastest == 0:
+            raise InputError("fluid.sound_speed: must be given (m/s), for nothing falls or moves at the start")
+        return MACH * fastest
+
+    def limits(self) -> dict[str, float]:
+        """Return what limits the step at the start by name, s."""
+        fastest = float(np.linalg.norm(self.v, axis=1).max())
+        return limits(self.law, fastest, float(np.linalg.norm(self.law.gravity)))
+
+    def dummies(self) -> Dummies:
+        """Return the wall particles of sides and obstacles."""
+        scene, domain = self._scene, self._domain
+        no_slip = () if self._fluid.viscosity == 0 else tuple(scene.obstacles)
+        return wall_dummies(domain, self.law.spacing, 2 * self.law.s, scene.obstacles, scene.directory, no_slip)
+
+    def rows(self, mine: slice) -> Mapping[str, np.ndarray]:
+        """Return the columns of some of the particles, with their ids."""
+        found = {name: getattr(self, name)[mine] for name in ("x", "v", "rho", "m")}
+        return {**found, "id": np.arange(len(self.x))[mine]}
+
+
+def limits(law: Law, fastest: float, strongest: float) -> dict[str, float]:
+    """Return what limits the step by name, s, at the largest speed (m/s) and acceleration (m/s^2)."""
+    found = {"sound": ACOUSTIC * law.s / (law.c + fastest)}
+    if law.nu > 0:
+        found["viscosity"] = VISCOUS * law.s**2 / law.nu
+    if strongest > 0:
+        found["forces"] = FORCED * float(np.sqrt(law.s / strongest))
+    return found

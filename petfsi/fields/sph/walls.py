@@ -1,0 +1,93 @@
+"""Wall particles at work: where they are on the ranks, whom they meet, what they feel."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from petfsi.fields.sph.balance import Boxes
+from petfsi.fields.sph.cells import CellGrid, PairLists, Pairs
+from petfsi.fields.sph.dummies import Dummies
+from petfsi.fields.sph.particles import Swarm
+from petfsi.fields.sph.passes import FluidRows, Passes, WallRows
+
+
+class Walls:
+    """Wall particles of sides and obstacles, at rest, on the ranks of a fluid's particles.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    grid : CellGrid
+        The fluid's.
+    boxes : Boxes
+        The fluid's at present.
+    dummies : Dummies
+        The same on every rank.
+
+    Attributes
+    ----------
+    pairs : Pairs
+        By fluid row the wall rows near it.
+    pressure, density : ndarray, shape (n,)
+        Of the rows, Pa and kg/m^3; complete after ``press``.
+    force : ndarray, shape (n, dim)
+        Of the last force pass, N; complete on owned rows.
+    """
+
+    def __init__(self, comm: MPI.Comm, grid: CellGrid, boxes: Boxes, dummies: Dummies):
+        dim = dummies.x.shape[1]
+        columns: dict[str, tuple[int | tuple[()], type]] = {
+            "volume": ((), np.float64),
+            "normal": (dim, np.float64),
+            "depth": ((), np.float64),
+            "no_slip": ((), np.int64),
+            "wall": ((), np.int64),
+            "p": ((), np.float64),
+            "rho": ((), np.float64),
+        }
+        self.names = dummies.names
+        self._swarm = Swarm(comm, grid, columns, boxes)
+        mine = slice(comm.rank, None, comm.size)
+        rows = {name: getattr(dummies, name)[mine] for name in ("x", "volume", "normal", "depth", "no_slip", "wall")}
+        self._swarm.insert(rows | {"id": np.arange(len(dummies.x))[mine]})
+        self._lists = PairLists()
+        self._make_rows()
+
+    def _make_rows(self) -> None:
+        self._swarm.rebuild()
+        rows = {name: self._swarm[name] for name in ("x", "volume", "normal", "depth")}
+        still = np.zeros_like(rows["x"])
+        self.rows = WallRows(v=still, a=still, no_slip=self._swarm["no_slip"].astype(bool), **rows)
+        self.force = np.zeros_like(still)
+
+    @property
+    def pressure(self) -> np.ndarray:
+        """Pressure of the rows, Pa."""
+        return self._swarm["p"]
+
+    @property
+    def density(self) -> np.ndarray:
+        """Density of the rows, kg/m^3."""
+        return self._swarm["rho"]
+
+    def meet(self, fluid: Swarm, reach: float) -> None:
+        """List the pairs with the fluid's particles, which have just been sorted. Collective."""
+        if fluid.boxes is not self._swarm.boxes:
+            self._swarm.rebuild(fluid.boxes)
+            self._make_rows()
+        walls = self._swarm
+        self.pairs: Pairs = self._lists.wall(
+            fluid["x"], fluid.owned, fluid.first, walls["x"], walls.owned, walls.first, fluid.counts, reach
+        )
+
+    def press(self, passes: Passes, fluid: FluidRows, p: np.ndarray) -> None:
+        """Take the pressure from the fluid's p (n,). Collective."""
+        self.pressure[:], self.density[:] = passes.wall_pressure(fluid, p, self.rows, self.pairs)
+        self._swarm.exchange("p", "rho")
+
+    def push(self) -> np.ndarray:
+        """Return this rank's share of the force on each wall, shape (n_walls, dim), N."""
+        owned, n = self._swarm.owned, len(self.names)
+        wall, force = self._swarm["wall"][owned], self.force[owned]
+        return np.stack([np.bincount(wall, force[:, a], n) for a in range(force.shape[1])], axis=1)

@@ -1,0 +1,112 @@
+"""What each kind of fluid would take: its part of the plan of a scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from petfsi.scene.fluids import MacFluid, SphFluid
+from petfsi.scene.schema import Scene
+
+#: Vectors of the length of all unknowns: those of 30 flexible GMRES iterations, and a few more.
+KRYLOV_VECTORS = 65
+#: A preconditioner holds about as much as this many copies of its matrix.
+PRECONDITIONER = 3.0
+#: Bytes of a matrix entry: a value and a column number.
+ENTRY_BYTES = 12
+#: Bytes that a particle takes with its list of pairs, by dimension.
+PARTICLE_BYTES = {2: 400, 3: 700}
+
+
+@dataclass(frozen=True)
+class FluidPlan:
+    """What a scene's fluid would take.
+
+    Attributes
+    ----------
+    rows : list of (str, str)
+        What there is of it, by name.
+    unknowns : int
+        That are solved for.
+    bytes, output_bytes : float
+        Of memory on all ranks together, and of one output.
+    skipped : list of str
+        What is neither allocated nor assembled for it, and why.
+    """
+
+    rows: list[tuple[str, str]]
+    unknowns: int
+    bytes: float
+    output_bytes: float
+    skipped: list[str]
+
+
+def fluid_plan(scene: Scene) -> FluidPlan:
+    """Return the plan of a scene's fluid; an empty one without any. Not collective; may read mesh files."""
+    if scene.fluid is None:
+        return FluidPlan([], 0, 0.0, 0.0, [])
+    return PLANS[scene.fluid.kind](scene)
+
+
+def fluid_skipped(scene: Scene) -> list[str]:
+    """Return what is neither allocated nor assembled for a scene's fluid, and why."""
+    return [] if scene.fluid is None else SKIPPED[scene.fluid.kind](scene)
+
+
+def _mac(scene: Scene) -> FluidPlan:
+    fluid, dim = scene.fluid, scene.dim
+    assert isinstance(fluid, MacFluid)
+    n = math.prod(fluid.cells)
+    rows = [("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, fluid.cells))}")]
+    arrays = 8 * (4 * dim + 4) + dim + 5 + (16 if fluid.smoke is not None else 0)
+    matrix = ENTRY_BYTES * (2 * dim + 1) * (1 + PRECONDITIONER)
+    per_output = 8 * (dim + 2 + (fluid.smoke is not None))
+    size = float(n * (arrays + matrix + 8 * KRYLOV_VECTORS))
+    return FluidPlan(rows, n, size, float(n * per_output), _mac_skipped(scene))
+
+
+def _mac_skipped(scene: Scene) -> list[str]:
+    fluid = scene.fluid
+    assert isinstance(fluid, MacFluid)
+    out = ["viscous terms: viscosity is 0"]
+    if fluid.smoke is None:
+        out.append("smoke: there is no [fluid.smoke]")
+    if not scene.obstacles:
+        out.append("obstacles: there are none")
+    if not scene.solids:
+        out.append("geometry after the first step: sides and obstacles do not move, the matrix stays")
+    return out
+
+
+def _sph(scene: Scene) -> FluidPlan:
+    from petfsi.fields.sph.start import Start
+
+    start, dim = Start(scene), scene.dim
+    n, n_walls, law = len(start.x), len(start.dummies().x), start.law
+    rows = [("particles", f"{n:,} of {law.spacing:g} m, and {n_walls:,} in walls; no unknowns: they are explicit")]
+    limits = ", ".join(f"{name} {limit:.3g} s" for name, limit in start.limits().items())
+    rows.append(("sound", f"{law.c:.4g} m/s; limits on the step at the start: {limits}"))
+    rows += [("note", note) for note in start.notes]
+    return FluidPlan(rows, 0, float((n + n_walls) * PARTICLE_BYTES[dim]), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
+
+
+def _sph_skipped(scene: Scene) -> list[str]:
+    fluid = scene.fluid
+    assert isinstance(fluid, SphFluid)
+    out = ["viscous terms: viscosity is 0"] if fluid.viscosity == 0 else []
+    if fluid.alpha == 0:
+        out.append("artificial viscosity: its coefficient is 0")
+    if fluid.density_diffusion == 0:
+        out.append("diffusion of density: its coefficient is 0")
+    if not fluid.shifting:
+        out.append("shifting: it is turned off")
+    if not scene.obstacles:
+        out.append("obstacles: there are none")
+    if not scene.solids:
+        out.append("solver: particles are explicit, and nothing else is there; no option under -fsi_ is read")
+    return out
+
+
+PLANS: dict[str, Callable[[Scene], FluidPlan]] = {"mac": _mac, "sph": _sph}
+SKIPPED: dict[str, Callable[[Scene], list[str]]] = {"mac": _mac_skipped, "sph": _sph_skipped}

@@ -1,0 +1,162 @@
+"""What a scene may say of its fluid: a table per kind, with the same words for the same things."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator
+from pydantic_core import PydanticCustomError
+
+from petfsi.registry import FLUIDS
+from petfsi.scene.tables import Cells, Flag, Number, Real, Shape, Table, Vector, one_of
+
+
+class Inflow(Table):
+    """A jet through (part of) a side."""
+
+    speed: Annotated[Number, Field(description="m/s into the domain; may depend on x, y, z, t")]
+    region: Annotated[Shape | None, Field(description="the part of the side in this shape, or all of it")] = None
+    ramp: Annotated[Real, Field(ge=0, description="s over which the speed grows smoothly from zero")] = 0.0
+    smoke: Annotated[Real, Field(ge=0, description="smoke carried in")] = 0.0
+    rest: Annotated[Literal["slip", "open"], Field(description="what the remainder of the side is")] = "slip"
+
+
+class InflowSide(Table):
+    """The table form of a side."""
+
+    inflow: Inflow
+
+
+def _side_form(value: Any) -> str:
+    """Tell the two forms of a side apart by their type, so that errors speak of one form only."""
+    return "<table>" if isinstance(value, dict | InflowSide) else "<name>"
+
+
+Side = Annotated[
+    Annotated[Literal["slip", "open", "periodic"], Tag("<name>")] | Annotated[InflowSide, Tag("<table>")],
+    Discriminator(_side_form),
+    Field(description="or { inflow = { speed = ... } }"),
+]
+
+
+ParticleSide = Literal["slip", "no-slip", "open", "periodic"]
+
+
+class Sides(Table):
+    """The sides of the grid; left/right bound x, bottom/top y, back/front z (3D only)."""
+
+    left: Side = "slip"
+    right: Side = "slip"
+    bottom: Side = "slip"
+    top: Side = "slip"
+    back: Side = "slip"
+    front: Side = "slip"
+
+
+class Smoke(Table):
+    """A scalar carried along with the fluid."""
+
+    initial: Annotated[Number, Field(description="may depend on x, y, z")] = 0.0
+    buoyancy: Annotated[Real, Field(description="acceleration against gravity per unit of smoke, over gravity")] = 0.0
+
+
+class FluidInitial(Table):
+    """The fluid at time zero."""
+
+    velocity: Annotated[list[Number] | None, Field(description="m/s; may depend on x, y, z")] = None
+
+
+class FluidTable(Table):
+    """What fluids of every kind say."""
+
+    kind: Annotated[str, BeforeValidator(one_of(FLUIDS))] = "mac"
+    density: Annotated[Real, Field(gt=0, description="kg/m^3")]
+    origin: Annotated[Vector, Field(description="m")]
+    size: Annotated[Vector, Field(description="m")]
+    initial: FluidInitial = FluidInitial()
+
+
+class MacFluid(FluidTable):
+    """An incompressible fluid on a regular staggered grid."""
+
+    form: ClassVar[str] = "<mac>"
+
+    viscosity: Annotated[Real, Field(description="Pa s")] = 0.0
+    cells: Cells
+    sides: Sides = Sides()
+    advection: Literal["cubic", "linear"] = "cubic"
+    smoke: Smoke | None = None
+
+    @field_validator("viscosity")
+    @classmethod
+    def _inviscid(cls, viscosity: float) -> float:
+        if viscosity != 0:
+            raise PydanticCustomError("inviscid", "must be 0: this version solves inviscid fluids")
+        return viscosity
+
+    @property
+    def resolution(self) -> float:
+        """The shortest length that it resolves, m."""
+        return min(size / n for size, n in zip(self.size, self.cells, strict=True))
+
+
+class ParticleSides(Table):
+    """The sides of the box that holds the particles."""
+
+    left: ParticleSide = "slip"
+    right: ParticleSide = "slip"
+    bottom: ParticleSide = "slip"
+    top: ParticleSide = "slip"
+    back: ParticleSide = "slip"
+    front: ParticleSide = "slip"
+
+
+class SphFluid(FluidTable):
+    """A weakly compressible fluid of particles."""
+
+    form: ClassVar[str] = "<sph>"
+
+    spacing: Annotated[Real, Field(gt=0, description="m between particles at the start")]
+    smoothing: Annotated[Real, Field(ge=1, le=3, description="smoothing length over the spacing")] = 1.5
+    kernel: Literal["wendland", "quadratic", "cubic"] = "wendland"
+    sound_speed: Annotated[Real | None, Field(gt=0, description="m/s")] = None
+    viscosity: Annotated[Real, Field(ge=0, description="Pa s")] = 0.0
+    artificial_viscosity: Annotated[Real | None, Field(ge=0, description="Monaghan's alpha")] = None
+    density_diffusion: Annotated[Real, Field(ge=0, le=1, description="delta of delta-SPH; 0 is none")] = 0.1
+    shifting: Flag = True
+    fill: Annotated[list[Shape], Field(min_length=1, description="where liquid is at the start")]
+    pressure: Annotated[Literal["hydrostatic", "none"], Field(description="at the start")] = "hydrostatic"
+    sides: ParticleSides = ParticleSides()
+
+    @property
+    def resolution(self) -> float:
+        """The shortest length that it resolves, m."""
+        return self.spacing
+
+    @property
+    def alpha(self) -> float:
+        """Monaghan's alpha: a little where nothing is said and the fluid has no viscosity."""
+        if self.artificial_viscosity is None:
+            return 0.05 if self.viscosity == 0 else 0.0
+        return self.artificial_viscosity
+
+    @property
+    def smoke(self) -> None:
+        """Particles carry none."""
+        return
+
+    @property
+    def cells(self) -> None:
+        """Particles have none."""
+        return
+
+
+def _fluid_form(value: Any) -> str:
+    """Tell kinds of fluids apart, so that errors speak of one of them only."""
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return SphFluid.form if kind == "sph" else MacFluid.form
+
+
+Fluid = Annotated[
+    Annotated[MacFluid, Tag(MacFluid.form)] | Annotated[SphFluid, Tag(SphFluid.form)], Discriminator(_fluid_form)
+]

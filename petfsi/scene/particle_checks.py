@@ -1,0 +1,45 @@
+"""What a fluid of particles must keep; each check yields the mistakes it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from petfsi.scene.fluids import SphFluid
+from petfsi.scene.mistakes import Problem
+from petfsi.scene.schema import Scene
+from petfsi.scene.shape_checks import MAX_CELLS, is_measured, periods, plain_shape
+
+#: Particles see so many smoothing lengths far, and lists of pairs a little farther.
+REACH = 2.1
+#: The box must be at least so many particles wide.
+FEWEST = 2
+
+
+def particles(scene: Scene) -> Iterator[Problem]:
+    """Judge the table of a fluid of particles."""
+    fluid = scene.fluid
+    if not isinstance(fluid, SphFluid):
+        return
+    if scene.solids:
+        yield Problem("fluid.kind", "sph", "does not meet solids yet: take out the [solids], or use mac", ("solids",))
+    for n, shape in enumerate(fluid.fill):
+        yield from plain_shape(f"fluid.fill.{n}", shape, scene.dim)
+    if is_measured(fluid, scene.dim):
+        yield from _spacing(fluid, scene.dim)
+
+
+def _spacing(fluid: SphFluid, dim: int) -> Iterator[Problem]:
+    """Judge the spacing beside the size of the box."""
+    uses, shortest, most = ("fluid.size",), min(fluid.size), 1.0
+    for size in fluid.size:
+        most *= size / fluid.spacing
+    if shortest < FEWEST * fluid.spacing:
+        allowed = f"must be at most {shortest / FEWEST:g} m, so that {FEWEST} particles lie across the box"
+        yield Problem("fluid.spacing", fluid.spacing, allowed, uses)
+    elif most > MAX_CELLS:
+        yield Problem("fluid.spacing", fluid.spacing, f"makes room for more than {MAX_CELLS} particles", uses)
+    reach = REACH * fluid.smoothing * fluid.spacing
+    for axis, period in zip("xyz", periods(fluid, dim), strict=False):
+        if 0 < period < reach:
+            allowed = f"{axis} repeats after {period:g} m, but particles see {reach:g} m far: less spacing or smoothing"
+            yield Problem("fluid.spacing", fluid.spacing, allowed, (*uses, "fluid.smoothing", "fluid.sides"))
