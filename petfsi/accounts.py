@@ -97,14 +97,14 @@ class Accounts:
         Parameters
         ----------
         pressure : ndarray or None
-            The step's solution of the fluid, Pa.
+            The step's solution of a fluid that solves for it, Pa.
         dt : float
         """
         if not self.values:
             return
         parts = [field.work(dt) for field in self.fields]
-        if pressure is not None:
-            parts += [coupling.work(pressure, dt) for coupling in self.couplings]
+        of_nothing = np.zeros(0)
+        parts += [coupling.work(of_nothing if pressure is None else pressure, dt) for coupling in self.couplings]
         self._enter(np.array([(-part.gravity, part.damping, part.loads, part.boundary) for part in parts]).sum(axis=0))
 
     def _enter(self, done: np.ndarray) -> None:

@@ -34,4 +34,4 @@ def build_couplings(scene: Scene, fields: list[Field]) -> list[Coupling]:
     if len(fields) < 2:
         return []
     solid, fluid = fields
-    return [find(COUPLINGS[scene.coupling.transfer])(fluid, solid, scene.coupling)]
+    return [find(COUPLINGS[scene.transfer])(fluid, solid, scene.coupling)]

@@ -123,7 +123,7 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
     if scene.probes:
         rows.append(("probes", ", ".join(f"{name} ({p.quantity} of {p.of})" for name, p in scene.probes.items())))
     if scene.fluid is not None and scene.solids:
-        rows.append(("coupling", scene.coupling.transfer))
+        rows.append(("coupling", scene.transfer))
     return rows
 
 
@@ -154,7 +154,7 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
         for name, obstacle in scene.obstacles.items()
         if obstacle.shape.mesh is not None
     ]
-    if scene.obstacles and scene.coupling.transfer == "cutcell":
+    if scene.obstacles and scene.transfer == "cutcell":
         readers = [partial(obstacle_surfaces, scene)]
     for read in [lambda: meshes.update(build_bodies(scene)), *readers]:
         try:

@@ -12,6 +12,7 @@ FLUIDS = {
 COUPLINGS = {
     "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
     "ray": "petfsi.couplings.ray:RayCoupling",
+    "pressure": "petfsi.couplings.particles:PressureTransfer",
 }
 MATERIALS = {
     "green": "petfsi.fields.solid.materials.green:green",

@@ -237,7 +237,7 @@ class Simulation:
             self.solid.judge(values["solid"], dt)
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
-            coupling.accept(t, dt)
+            coupling.accept(values, t, dt)
         if self.fluid:
             self.fluid.accept(values.get(self.fluid.name, NOTHING), t, dt)
         if self.regions:
@@ -324,6 +324,8 @@ class Simulation:
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
+        for coupling in self.couplings:
+            coupling.restored()
         if self.regions:
             self.regions.restore(group("regions"))
         if self.accounts.columns:

@@ -288,7 +288,7 @@ def test_a_face_takes_the_velocity_where_the_ray_meets_the_facet():
     facets = np.array([[0, 1], [1, 2], [2, 0]])
     it = couple(MPI.COMM_SELF, [16, 16], [1.0, 1.0], points, facets)
     it.solid.velocity = np.column_stack((1 + 2 * points[:, 0] - points[:, 1], 3 * points[:, 1] - points[:, 0]))
-    it.coupling.accept(0.0, 0.1)
+    it.coupling.accept({}, 0.0, 0.1)
     n = 0
     for a in range(2):
         faces = np.argwhere(it.fluid.face_kind[a] == SOLID_FACE)
@@ -412,7 +412,7 @@ def test_any_number_of_ranks_gives_the_serial_answer(dim, sides):
     for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
         it = couple(comm, cells, size, points, facets, sides=sides)
         it.solid.velocity = velocity
-        it.coupling.accept(0.0, 0.1)
+        it.coupling.accept({}, 0.0, 0.1)
         found.append((it, force(it, pressure), outflow(it, velocity)))
     (it, forces, flux), (serial, serial_forces, serial_flux) = found
     assert np.allclose(forces, serial_forces, rtol=0, atol=1e-15)
@@ -549,7 +549,7 @@ def test_a_block_of_elements_under_water(dim):
     assert np.allclose(nodal, expected[mine], rtol=0, atol=1e-13)
     free_rims = 0.4 ** (dim - 1)
     assert total[1] == pytest.approx(-4.0 * free_rims, rel=1e-12)
-    coupling.accept(0.0, 0.1)
+    coupling.accept({}, 0.0, 0.1)
     top = fluid.face_kind[1] == SOLID_FACE
     y = np.broadcast_to(fluid.grid.coordinates(1)[1], top.shape)
     assert np.allclose(fluid.boundary_velocity[1][top & (y > 0.6)], 0.2, rtol=0, atol=1e-14)

@@ -375,10 +375,8 @@ def test_elimination_gives_the_solution_of_the_reduced_system():
     got = dense(held_body.block)
     np.testing.assert_allclose(np.linalg.solve(got, held_body.rhs), expected, atol=1e-12)
     assert np.abs(got[np.ix_(fixed, ~fixed)]).max() == 0
-    diagonal = np.diag(got)[fixed]
-    rest = field(2, b=body(2))
-    rest.assemble(0.0, 0.1)
-    np.testing.assert_allclose(diagonal, np.diag(dense(rest.block)).mean(), rtol=1e-13)
+    # inertia: with stiffness |b|, which the solver's bound is relative to, would grow with it
+    np.testing.assert_allclose(np.diag(got)[fixed], held_body.mean_mass / 0.1, rtol=1e-13)
 
 
 @pytest.mark.parallel([1, 3])

@@ -9,7 +9,7 @@ import pytest
 from petfsi.fields.sph.cells import PairLists, cell_grid, fluid_pairs, sorted_rows, wall_pairs
 from petfsi.fields.sph.kernels import ALPHA, Kernel
 from petfsi.fields.sph.law import Law
-from petfsi.fields.sph.passes import FluidRows, Passes, WallRows
+from petfsi.fields.sph.passes import FluidRows, Met, Passes, WallRows
 
 KERNELS = tuple(ALPHA)
 GRAVITY = {2: (0.7, -9.81), 3: (0.7, 0.3, -9.81)}
@@ -145,13 +145,13 @@ class Rows:
     def everything(self, low=None, high=None):
         """All results of a rank's passes, by name."""
         rows, passes = self.part(low, high), Passes(self.law)
-        rates = passes.density_rates(rows.fluid, rows.pairs, rows.walls, rows.wall_pairs)
-        pressure, density = passes.wall_pressure(rows.fluid, rows.p, rows.walls, rows.wall_pairs)
-        state = (rows.walls, rows.p_wall, rows.rho_wall, rows.wall_pairs)
-        forces = passes.forces(rows.fluid, rows.p, rows.pairs, *state)
+        met = Met(rows.walls, rows.wall_pairs, rows.p_wall, rows.rho_wall)
+        rates = passes.density_rates(rows.fluid, rows.pairs, met)
+        pressure, density = passes.wall_pressure(rows.fluid, rows.p, met)
+        forces = passes.forces(rows.fluid, rows.p, rows.pairs, met)
         fluid = {"total": rates.total, "diffusive": rates.diffusive, "f": forces.f, "S": forces.S}
         fluid["dissipated"] = forces.dissipated
-        return rows, fluid, {"pressure": pressure, "density": density, "f_wall": forces.f_wall}
+        return rows, fluid, {"pressure": pressure, "density": density, "f_wall": forces.f_walls[0]}
 
 
 def listed(pairs):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,6 +73,9 @@ class Coupling(ABC):
     def rewind(self) -> None:
         """Forget for which positions the operators are: the fields forget the step that was tried."""
 
+    def restored(self) -> None:  # noqa: B027 - most have nothing to tell
+        """Tell fields of each other what they need after ``restore``. Collective."""
+
     @abstractmethod
     def work(self, pressure: np.ndarray, dt: float) -> Work:
         """Return this rank's share of what the coupling's own forces did in the step last accepted.
@@ -87,5 +91,12 @@ class Coupling(ABC):
         """
 
     @abstractmethod
-    def accept(self, time: float, dt: float) -> None:
-        """Hand over what the second field needs of the first, after the first one has accepted. Collective."""
+    def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
+        """Hand over what the second field needs of the first, after the first one has accepted. Collective.
+
+        Parameters
+        ----------
+        values : mapping of str to ndarray
+            The step's solution by field, SI, this rank's.
+        time, dt : float
+        """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -235,5 +236,5 @@ class CutCellCoupling(Coupling):
             pressed = dt * float(pressure @ outflow)
         return Work(gravity=free + held, boundary=-pressed - held)
 
-    def accept(self, time: float, dt: float) -> None:
+    def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Do nothing: no face takes its velocity from the solid."""

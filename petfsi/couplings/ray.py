@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -241,7 +242,7 @@ class RayCoupling(Coupling):
         held = self._held_outflow
         return Work(boundary=-dt * float(pressure @ held) if len(held) else 0.0)
 
-    def accept(self, time: float, dt: float) -> None:
+    def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give the faces that the solid took its new velocity, in ghosts, too."""
         velocity = self.solid.surface_velocity()
         for a, faces in enumerate(self._faces):

@@ -138,6 +138,12 @@ def _fluid(scene: Scene) -> Problems:
         yield Problem("fluid.smoke.buoyancy", fluid.smoke.buoyancy, allowed, ("gravity",))
 
 
+def _transfer(scene: Scene) -> Problems:
+    if scene.fluid is not None and scene.transfer not in scene.fluid.transfers:
+        allowed = f"must be one of {', '.join(scene.fluid.transfers)} for fluid.kind = {scene.fluid.kind}"
+        yield Problem("coupling.transfer", scene.transfer, allowed, ("fluid.kind",))
+
+
 def _sides(scene: Scene) -> Problems:
     if scene.fluid is None:
         return
@@ -312,6 +318,7 @@ CHECKS: tuple[Callable[[Scene], Problems], ...] = (
     _time,
     _static,
     _fluid,
+    _transfer,
     _sides,
     particles,
     _solids,

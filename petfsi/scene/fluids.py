@@ -80,6 +80,7 @@ class MacFluid(FluidTable):
     """An incompressible fluid on a regular staggered grid."""
 
     form: ClassVar[str] = "<mac>"
+    transfers: ClassVar[tuple[str, ...]] = ("cutcell", "ray")
 
     viscosity: Annotated[Real, Field(description="Pa s")] = 0.0
     cells: Cells
@@ -115,6 +116,7 @@ class SphFluid(FluidTable):
     """A weakly compressible fluid of particles."""
 
     form: ClassVar[str] = "<sph>"
+    transfers: ClassVar[tuple[str, ...]] = ("pressure",)
 
     spacing: Annotated[Real, Field(gt=0, description="m between particles at the start")]
     smoothing: Annotated[Real, Field(ge=1, le=3, description="smoothing length over the spacing")] = 1.5

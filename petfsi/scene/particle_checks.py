@@ -20,8 +20,6 @@ def particles(scene: Scene) -> Iterator[Problem]:
     fluid = scene.fluid
     if not isinstance(fluid, SphFluid):
         return
-    if scene.solids:
-        yield Problem("fluid.kind", "sph", "does not meet solids yet: take out the [solids], or use mac", ("solids",))
     for n, shape in enumerate(fluid.fill):
         yield from plain_shape(f"fluid.fill.{n}", shape, scene.dim)
     if is_measured(fluid, scene.dim):

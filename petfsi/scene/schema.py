@@ -155,7 +155,7 @@ class Obstacle(Table):
 class Coupling(Table):
     """How fluid and solids are joined."""
 
-    transfer: Annotated[str, BeforeValidator(one_of(COUPLINGS))] = "cutcell"
+    transfer: Annotated[str | None, BeforeValidator(one_of(COUPLINGS, optional=True))] = None
     #: Facets are split until their pieces are about a cell / quadrature.
     quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
 
@@ -203,6 +203,11 @@ class Scene(Table):
         """Remember where the scene was read."""
         if context:
             self._directory = Path(context["directory"])
+
+    @property
+    def transfer(self) -> str:
+        """How fluid and solids are joined: as the scene says, else as suits the kind of fluid."""
+        return self.coupling.transfer or (self.fluid.transfers[0] if self.fluid is not None else "cutcell")
 
     @property
     def directory(self) -> Path:

@@ -21,12 +21,14 @@ def _number_or_text(value: Any) -> Any:
     return value
 
 
-def one_of(names: Collection[str]) -> Callable[[Any], str]:
+def one_of(names: Collection[str], optional: bool = False) -> Callable[[Any], str | None]:
     """Return a validator of names that are registered elsewhere, which speaks as those of literals do."""
     quoted = [f"'{name}'" for name in names]
     expected = " or ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
 
-    def known(value: Any) -> str:
+    def known(value: Any) -> str | None:
+        if optional and value is None:
+            return None
         if not isinstance(value, str) or value not in names:
             raise PydanticCustomError("literal_error", "Input should be {expected}", {"expected": expected})
         return value

@@ -87,7 +87,7 @@ class CoveredGrid(PressureFluid):
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
         self.cell_volume, self.n_cells = grid.cell_volume, grid.layout.n_local
         self.surroundings = Surroundings(grid, fluid.sides)
-        self._cutter = self._make_cutter() if scene.coupling.transfer == "cutcell" else None
+        self._cutter = self._make_cutter() if scene.transfer == "cutcell" else None
         if self._cutter is None:
             for name, obstacle in scene.obstacles.items():
                 self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)

@@ -15,11 +15,12 @@ from petfsi.fields.mac.extrapolate import FAR, Band
 from petfsi.fields.mac.faces import Faces, each
 from petfsi.fields.mac.lineage import Lineage
 from petfsi.fields.mac.marks import beside
-from petfsi.fields.mac.parts import Parts, read_whole, whole_slab
+from petfsi.fields.mac.parts import Parts
 from petfsi.fields.mac.sheets import Sheets
 from petfsi.fields.mac.sides import evaluate_at, wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
+from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.ranks import agreed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression
@@ -78,7 +79,7 @@ class MacFluid(CoveredGrid):
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
         self._gravity = [Expression(g, ("t",), key="gravity") for g in gravity]
         # the ray transfer stays as it was published
-        exact = scene.coupling.transfer == "cutcell" and scene.gravity is not None
+        exact = scene.transfer == "cutcell" and scene.gravity is not None
         self.weight = Weight(grid, self.density, self._gravity) if exact else None
         self._uncover()
         self._start()

@@ -18,19 +18,23 @@ from mpi4py import MPI
 
 from petfsi.errors import SolveError
 from petfsi.fields.base import FluidField, Reader, Slab, Stock, Work
+from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.fields.sph import moves, probes
 from petfsi.fields.sph.balance import bisect
 from petfsi.fields.sph.cells import PairLists, Pairs
 from petfsi.fields.sph.particles import StrayError, Swarm
 from petfsi.fields.sph.passes import FluidRows, Passes
 from petfsi.fields.sph.room import Room
-from petfsi.fields.sph.start import Start, limits
+from petfsi.fields.sph.skin import Skin
+from petfsi.fields.sph.start import Start, depth_behind, limits
 from petfsi.fields.sph.walls import Walls
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
 #: Lists of pairs reach so much farther than particles see: they hold while no two came nearer by as much.
 SKIN = 0.05
+#: Particles begin so far, in spacings, before solids.
+CLEARANCE = 0.25
 #: What a checkpoint holds besides "id" and "x".
 STORED = ("v", "rho", "m", "a", "S")
 
@@ -45,7 +49,9 @@ class SphFluid(FluidField):
     passes : Passes
         With the law.
     walls : Walls or None
-        None where no side and no obstacle holds the fluid.
+        Those at rest; None where no side and no obstacle holds the fluid.
+    skin : Skin or None
+        Those of solids, if a coupling has put any in.
     pairs : Pairs
         Of particles, as last listed.
     room : Room
@@ -74,6 +80,7 @@ class SphFluid(FluidField):
         self.swarm.rebuild(boxes)
         dummies = start.dummies()
         self.walls = Walls(comm, self.room.grid, boxes, dummies) if len(dummies.x) else None
+        self.skin: Skin | None = None
         self._notes = start.notes
         self.swarm["a"][:] = self.gravity(0.0)
         self._forget_step()
@@ -83,6 +90,32 @@ class SphFluid(FluidField):
         """Know nothing of a step under way, and of no pairs."""
         self._listed = self._pushed = self._moving = False
         self._way, self._diffused, self._dissipated = np.zeros(self.dim), 0.0, 0.0
+
+    def immerse(self, points: np.ndarray, facets: np.ndarray) -> Skin:
+        """Put a surface with these points (n, dim) and facets into the fluid, and return what stands for it there.
+
+        Particles in thin bodies, or next to nothing before a surface, are taken out. Collective.
+        """
+        near = CLEARANCE * self.spacing
+        depth = depth_behind(self.swarm["x"], points, facets, self.room.reach)
+        inside = self.swarm.owned & (depth > -near)
+        dropped = self.comm.allreduce(int(np.count_nonzero(inside)))
+        if dropped:
+            self.swarm.remove(inside)
+            self.swarm.rebuild()
+            self._notes.append(f"fluid.fill: {dropped} places lie in solids, or less than {near:g} m before them")
+        no_slip = self.law.nu > 0
+        self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, no_slip)
+        self._listed = False
+        return self.skin
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether a step is under way: predicted and not accepted."""
+        return self._moving
+
+    def _sets(self) -> list[Walls | Skin]:
+        return [walls for walls in (self.walls, self.skin) if walls is not None]
 
     def gravity(self, t: float) -> np.ndarray:
         """Return the acceleration of gravity at a time, shape (dim,), m/s^2."""
@@ -96,6 +129,8 @@ class SphFluid(FluidField):
         self._way, self._diffused, self._pushed, self._moving = np.zeros(self.dim), 0.0, False, True
         moves.kick(swarm["v"], swarm["a"], half)
         moves.drift(swarm["x"], swarm["v"], half)
+        if self.skin is not None:
+            self.skin.place(self.skin.points + half * self.skin.velocity, self.skin.velocity)
         self._refresh("x", "v", "rho")
         swarm = self.swarm
         self._condense(time + half, dt)
@@ -113,28 +148,30 @@ class SphFluid(FluidField):
         """Take the density to the end of the step. Collective."""
         swarm, mine = self.swarm, self.swarm.owned
         self._weigh(time)
-        walls = (None, None) if self.walls is None else (self.walls.rows, self.walls.pairs)
-        rates = self.passes.density_rates(self._rows(), self.pairs, *walls)
+        rates = self.passes.density_rates(self._rows(), self.pairs, *(walls.met for walls in self._sets()))
         rho = swarm["rho"][mine]
         power = swarm["m"][mine] * self.law.pressure(rho) / rho**2 @ rates.diffusive[mine]
         self._diffused -= dt * float(power)
         swarm["rho"] += dt * rates.total
 
     def assemble(self, time: float, dt: float) -> None:
-        """Find the forces where the step has brought the particles. Collective; once a step."""
+        """Find the forces, unless a coupling has asked for them already. Collective."""
+        self.push(time, dt)
+
+    def push(self, time: float, dt: float) -> None:
+        """Find the forces where the step has brought the particles and walls. Collective; once a step."""
         if self._pushed:
             return
         end = time + dt if self._moving else time
         self._refresh("x", "rho")
         self._weigh(end)
-        fluid, walls = self._rows(), self.walls
+        fluid, sets = self._rows(), self._sets()
         p = self.law.pressure(fluid.rho)
-        if walls is None:
-            forces = self.passes.forces(fluid, p, self.pairs)
-        else:
+        for walls in sets:
             walls.press(self.passes, fluid, p)
-            forces = self.passes.forces(fluid, p, self.pairs, walls.rows, walls.pressure, walls.density, walls.pairs)
-            walls.force = forces.f_wall
+        forces = self.passes.forces(fluid, p, self.pairs, *(walls.met for walls in sets))
+        for walls, force in zip(sets, forces.f_walls, strict=True):
+            walls.take(force)
         mine = self.swarm.owned
         self._dissipated = dt * float(forces.dissipated[mine].sum())
         self.swarm["S"] = moves.fade(forces.S, forces.full)
@@ -168,7 +205,8 @@ class SphFluid(FluidField):
         """
         swarm = self.swarm
         way = moves.farthest(swarm["x"], swarm["anchor"], swarm.owned) if self._listed else np.inf
-        way = self.comm.allreduce(np.inf if np.isnan(way) else way, MPI.MAX)
+        way = max([np.inf if np.isnan(way) else way, *(walls.farthest() for walls in self._sets())])
+        way = self.comm.allreduce(way, MPI.MAX)
         if 2 * way < SKIN * self.room.reach:
             swarm.exchange(*names)
         else:
@@ -185,8 +223,8 @@ class SphFluid(FluidField):
             raise SolveError(f"the particles have blown up: {error}") from None
         swarm["anchor"][:] = swarm["x"]
         self.pairs: Pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
-        if self.walls is not None:
-            self.walls.meet(swarm, reach)
+        for walls in self._sets():
+            walls.meet(swarm, reach)
         self._listed = True
 
     # ---- how long a step may be -----------------------------------------------------------------------------------
@@ -270,11 +308,14 @@ class SphFluid(FluidField):
 
     def state(self) -> dict[str, Slab]:
         """Return all that the next step reads, by id. Collective."""
-        return self.swarm.slabs(STORED)
+        skin = {} if self.skin is None else {"skin_force": whole_slab(self.comm.rank, self.skin.last.ravel())}
+        return self.swarm.slabs(STORED) | skin
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
         self.swarm.restore(read, STORED)
+        if self.skin is not None:
+            self.skin.last = read_whole(read, "skin_force").reshape(-1, self.dim)
         self._forget_step()
         self._pushed = True  # a is that of the forces
         self._measure_speeds()

@@ -32,6 +32,9 @@ from petfsi.fields.sph import loops
 from petfsi.fields.sph.cells import Pairs
 from petfsi.fields.sph.law import Law
 
+#: Over so many spacings above its facet a wall particle that is seen from before comes into sight.
+EDGE = 0.25
+
 
 class FluidRows(NamedTuple):
     """Fluid rows: x (n, dim) m, v (n, dim) m/s, rho (n,) kg/m^dim, m (n,) kg."""
@@ -57,6 +60,19 @@ class WallRows(NamedTuple):
     no_slip: np.ndarray
 
 
+class Met(NamedTuple):
+    """A set of wall rows, the pairs of fluid rows with them, and, once known, their pressure (Pa) and density.
+
+    ``sided`` ones are seen from before their facets alone: bodies may be thinner than particles see.
+    """
+
+    rows: WallRows
+    pairs: Pairs
+    pressure: np.ndarray | None = None
+    density: np.ndarray | None = None
+    sided: bool = False
+
+
 class Rates(NamedTuple):
     """Rates of density (n,), kg/m^dim/s: all of D, and the part of it that is diffusion."""
 
@@ -78,15 +94,15 @@ class Forces(NamedTuple):
     dissipated : ndarray, shape (n,)
         Power lost to Pi and c, W: all of a fluid pair's at the first of its two rows, of a wall pair's at the fluid's,
         so that the sum over owned rows of all ranks counts each pair once.
-    f_wall : ndarray, shape (n_d, dim)
-        Force on each wall row, N.
+    f_walls : list of ndarray, shape (n_d, dim)
+        Force on each wall row of each set, N.
     """
 
     f: np.ndarray
     S: np.ndarray
     full: np.ndarray
     dissipated: np.ndarray
-    f_wall: np.ndarray
+    f_walls: list[np.ndarray]
 
 
 class Passes:
@@ -99,15 +115,15 @@ class Passes:
         self.law = law
         which = law.dim, law.kernel.number
         self._density = loops.density_loop(*which, law.delta > 0)
-        self._wall_density = loops.wall_density_loop(*which)
-        self._wall_pressure = loops.wall_pressure_loop(*which)
+        self._which = which
         self._force = loops.force_loop(*which, law.alpha > 0, law.nu > 0)
-        self._wall_force = loops.wall_force_loop(*which)
         self._rows, self._sums, self._scaled = np.empty((0, 8)), np.empty((0, 8)), np.empty(0)
 
-    def density_rates(
-        self, fluid: FluidRows, pairs: Pairs, walls: WallRows | None = None, wall_pairs: Pairs | None = None
-    ) -> Rates:
+    @property
+    def _inv_edge(self) -> float:
+        return 1 / (EDGE * self.law.spacing)
+
+    def density_rates(self, fluid: FluidRows, pairs: Pairs, *walls: Met) -> Rates:
         """Return D (n,), from the fluid's pairs and those with walls."""
         law = self.law
         n = self._pack(fluid)
@@ -116,32 +132,25 @@ class Passes:
         g = np.array([*law.gravity, 0.0][:3]) * (law.rho0 / law.c**2)
         diffusion = -2 * law.delta * law.s * law.c
         self._density(*_unsigned(pairs), rows, 1 / law.s, law.kernel.f_scale, diffusion, g, loops.LANES, *rates)
-        if walls is not None and wall_pairs is not None and wall_pairs.other.size:
-            args = (rows, walls.x, walls.v, walls.volume, 1 / law.s, law.kernel.f_scale)
-            self._wall_density(*_unsigned(wall_pairs), *args, rates.total)
+        for met in walls:
+            wall = met.rows
+            args = (rows, wall.x, wall.v, wall.volume, wall.normal, wall.depth, self._inv_edge)
+            add = loops.wall_density_loop(*self._which, met.sided)
+            add(*_unsigned(met.pairs), *args, 1 / law.s, law.kernel.f_scale, rates.total)
         return rates
 
-    def wall_pressure(
-        self, fluid: FluidRows, p: np.ndarray, walls: WallRows, wall_pairs: Pairs
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def wall_pressure(self, fluid: FluidRows, p: np.ndarray, met: Met) -> tuple[np.ndarray, np.ndarray]:
         """Return pressure (n_d,) Pa and density (n_d,) of wall rows, from the pressure p (n,) of the fluid."""
-        law = self.law
+        law, walls = self.law, met.rows
         pressure, weight = np.zeros(walls.x.shape[0]), np.zeros(walls.x.shape[0])
-        args = (fluid.x, fluid.rho, p, walls.x, walls.a, np.array(law.gravity), 1 / law.s)
-        self._wall_pressure(*_unsigned(wall_pairs), *args, pressure, weight)
+        place = (walls.x, walls.a, walls.normal, walls.depth, self._inv_edge)
+        average = loops.wall_pressure_loop(*self._which, met.sided)
+        args = (fluid.x, fluid.rho, p, *place, np.array(law.gravity), 1 / law.s)
+        average(*_unsigned(met.pairs), *args, pressure, weight)
         return pressure, law.density(pressure)
 
-    def forces(
-        self,
-        fluid: FluidRows,
-        p: np.ndarray,
-        pairs: Pairs,
-        walls: WallRows | None = None,
-        p_wall: np.ndarray | None = None,
-        rho_wall: np.ndarray | None = None,
-        wall_pairs: Pairs | None = None,
-    ) -> Forces:
-        """Return forces, S and dissipation for pressures p (n,) of the fluid and p_wall, rho_wall (n_d,) of walls."""
+    def forces(self, fluid: FluidRows, p: np.ndarray, pairs: Pairs, *walls: Met) -> Forces:
+        """Return forces, S and dissipation for pressures p (n,) of the fluid, and walls with theirs."""
         law, kernel = self.law, self.law.kernel
         n = self._pack(fluid)
         rows, sums, scaled = self._rows, self._sums, self._scaled[:n]
@@ -150,15 +159,18 @@ class Passes:
         constants = (1 / law.s, kernel.f_scale, 0.2**0.25 * kernel.w_scale / kernel.at(law.spacing))
         viscous = (2 * law.alpha * law.c * law.s, 0.01 * law.s**2, 4 * law.nu)
         self._force(*_unsigned(pairs), rows, scaled, *constants, *viscous, loops.LANES, sums)
-        f_wall = np.zeros((0 if walls is None else walls.x.shape[0], law.dim))
-        if walls is not None and wall_pairs is not None and wall_pairs.other.size:
-            assert p_wall is not None and rho_wall is not None, "walls come with their pressure and density"
-            state = (p_wall / rho_wall**2, rho_wall, walls.volume)
-            place = (walls.x, walls.v, walls.normal, walls.depth, walls.no_slip)
-            self._wall_force(*_unsigned(wall_pairs), rows, scaled, *place, *state, *constants, 4 * law.nu, sums, f_wall)
+        f_walls = []
+        for met in walls:
+            assert met.pressure is not None and met.density is not None, "walls come with their pressure and density"
+            wall, f_wall = met.rows, np.zeros_like(met.rows.x)
+            state = (met.pressure / met.density**2, met.density, wall.volume)
+            place = (wall.x, wall.v, wall.normal, wall.depth, self._inv_edge, wall.no_slip)
+            add = loops.wall_force_loop(*self._which, met.sided)
+            add(*_unsigned(met.pairs), rows, scaled, *place, *state, *constants, 4 * law.nu, sums, f_wall)
+            f_walls.append(f_wall)
         f, S, dissipated, full = np.empty((n, law.dim)), np.empty((n, law.dim)), np.empty(n), np.empty(n)
         loops.unpack(sums, f, S, dissipated, full)
-        return Forces(f, S, full, dissipated, f_wall)
+        return Forces(f, S, full, dissipated, f_walls)
 
     def _pack(self, fluid):
         """Fill the packed rows, in more memory if need be; return the number of rows."""

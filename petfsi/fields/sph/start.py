@@ -10,9 +10,10 @@ from petfsi.errors import InputError
 from petfsi.fields.sph.dummies import Domain, Dummies, wall_dummies
 from petfsi.fields.sph.fill import hydrostatic, liquid
 from petfsi.fields.sph.law import Law
+from petfsi.fields.sph.solids import nearest, pseudonormals
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Scene
+from petfsi.scene.schema import Obstacle, Scene
 from petfsi.scene.shape_checks import OPPOSITE
 
 #: The sound speed is so many times the fastest flow, so that density varies by one in a hundred.
@@ -49,7 +50,8 @@ class Start:
         low = np.array(fluid.origin, dtype=float)
         sides = tuple((getattr(fluid.sides, a), getattr(fluid.sides, b)) for a, b in OPPOSITE[: scene.dim])
         self._domain = Domain(low, low + fluid.size, sides)
-        found = liquid(self._domain, fluid.spacing, fluid.fill, scene.obstacles, scene.directory, fitted=True)
+        solid = scene.obstacles | _bodies(scene)
+        found = liquid(self._domain, fluid.spacing, fluid.fill, solid, scene.directory, fitted=True)
         self.x, self.notes = found.x, list(found.notes)
         if not len(self.x):
             raise InputError("fluid.fill: holds no particle; is it outside the box, or inside an obstacle?")
@@ -108,6 +110,18 @@ class Start:
         return {**found, "id": np.arange(len(self.x))[mine]}
 
 
+def _bodies(scene: Scene) -> dict[str, Obstacle]:
+    """Return what solids fill at the start, as obstacles; beams are too thin, and displaced ones are elsewhere."""
+    found = {}
+    for name, solid in scene.solids.items():
+        shape = solid.shape
+        if shape.beam is None and shape.cavity is None and solid.initial.displacement is None:
+            parts = {kind: getattr(shape, kind) for kind in ("box", "ball") if getattr(shape, kind) is not None}
+            plain = {kind: part.model_copy(update={"cells": None}) for kind, part in parts.items()}
+            found[f"solids.{name}"] = Obstacle(shape=shape.model_copy(update=plain))
+    return found
+
+
 def limits(law: Law, fastest: float, strongest: float) -> dict[str, float]:
     """Return what limits the step by name, s, at the largest speed (m/s) and acceleration (m/s^2)."""
     found = {"sound": ACOUSTIC * law.s / (law.c + fastest)}
@@ -116,3 +130,9 @@ def limits(law: Law, fastest: float, strongest: float) -> dict[str, float]:
     if strongest > 0:
         found["forces"] = FORCED * float(np.sqrt(law.s / strongest))
     return found
+
+
+def depth_behind(x: np.ndarray, points: np.ndarray, facets: np.ndarray, reach: float) -> np.ndarray:
+    """Return how deep places x (n, dim) lie behind a surface, m; minus infinity farther than ``reach`` from it."""
+    depth, _ = nearest(x, points[facets], pseudonormals(points, facets), reach, reach)
+    return np.where(np.isfinite(depth), depth, -np.inf)

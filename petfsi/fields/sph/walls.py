@@ -6,10 +6,10 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.fields.sph.balance import Boxes
-from petfsi.fields.sph.cells import CellGrid, PairLists, Pairs
+from petfsi.fields.sph.cells import CellGrid, PairLists
 from petfsi.fields.sph.dummies import Dummies
 from petfsi.fields.sph.particles import Swarm
-from petfsi.fields.sph.passes import FluidRows, Passes, WallRows
+from petfsi.fields.sph.passes import FluidRows, Met, Passes, WallRows
 
 
 class Walls:
@@ -27,10 +27,8 @@ class Walls:
 
     Attributes
     ----------
-    pairs : Pairs
-        By fluid row the wall rows near it.
-    pressure, density : ndarray, shape (n,)
-        Of the rows, Pa and kg/m^3; complete after ``press``.
+    met : Met
+        The rows, by fluid row those near it, and their pressure and density, complete after ``press``.
     force : ndarray, shape (n, dim)
         Of the last force pass, N; complete on owned rows.
     """
@@ -61,15 +59,9 @@ class Walls:
         self.rows = WallRows(v=still, a=still, no_slip=self._swarm["no_slip"].astype(bool), **rows)
         self.force = np.zeros_like(still)
 
-    @property
-    def pressure(self) -> np.ndarray:
-        """Pressure of the rows, Pa."""
-        return self._swarm["p"]
-
-    @property
-    def density(self) -> np.ndarray:
-        """Density of the rows, kg/m^3."""
-        return self._swarm["rho"]
+    def farthest(self) -> float:
+        """Return how far they have gone since pairs were listed: nowhere."""
+        return 0.0
 
     def meet(self, fluid: Swarm, reach: float) -> None:
         """List the pairs with the fluid's particles, which have just been sorted. Collective."""
@@ -77,14 +69,19 @@ class Walls:
             self._swarm.rebuild(fluid.boxes)
             self._make_rows()
         walls = self._swarm
-        self.pairs: Pairs = self._lists.wall(
+        pairs = self._lists.wall(
             fluid["x"], fluid.owned, fluid.first, walls["x"], walls.owned, walls.first, fluid.counts, reach
         )
+        self.met = Met(self.rows, pairs, walls["p"], walls["rho"])
 
     def press(self, passes: Passes, fluid: FluidRows, p: np.ndarray) -> None:
         """Take the pressure from the fluid's p (n,). Collective."""
-        self.pressure[:], self.density[:] = passes.wall_pressure(fluid, p, self.rows, self.pairs)
+        self._swarm["p"], self._swarm["rho"] = passes.wall_pressure(fluid, p, self.met)
         self._swarm.exchange("p", "rho")
+
+    def take(self, force: np.ndarray) -> None:
+        """Take the forces of the last pass."""
+        self.force = force
 
     def push(self) -> np.ndarray:
         """Return this rank's share of the force on each wall, shape (n_walls, dim), N."""

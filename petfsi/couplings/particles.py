@@ -1,0 +1,190 @@
+"""Particles and solids: wall particles hang on the surface, and what they feel goes to the solid's nodes.
+
+The force on a wall particle is minus what it does to the fluid's, pair by pair, and goes to the points of its facet and
+on to the unknowns by the transpose of the maps that give their velocities: momentum is kept to round-off, and the
+surface's forces do no work that the fluid does not lose.
+
+An explicit fluid answers a wall's velocity with the impedance of sound: coupled explicitly, a wall lighter than half
+the mass that sound reaches in a step blows up. So the force is linearised in the wall's velocity. With u^ the velocity
+that the densities of the step saw and E_i = sum_d m_d F r_id lambda_d the row of particle i,
+
+    delta p_i = -h c_i^2 E_i (u - u^),        K_w = 2 h sum_i (m_i c_i^2 / rho_i^2) E_i^T E_i,
+
+K_w u stands in the solid's block and K_w u^ on the right, and after the solve the particles take their share of the
+same pairs: delta rho_i = delta p_i / c_i^2 and the force that goes with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import csr_matrix
+
+from petfsi.couplings.base import Coupling
+from petfsi.fields.base import SolidField, Work
+from petfsi.fields.sph.fluid import SphFluid
+from petfsi.fields.sph.passes import EDGE
+from petfsi.geometry.surfaces import Surface
+from petfsi.petsc import gather_sums, gather_triplets
+from petfsi.scene import schema
+
+
+class PressureTransfer(Coupling):
+    """Pressure (and drag) of wall particles on a solid: K_w in its block, no block off the diagonal.
+
+    Parameters
+    ----------
+    fluid : SphFluid
+    solid : SolidField
+    spec : schema.Coupling
+    """
+
+    def __init__(self, fluid: SphFluid, solid: SolidField, spec: schema.Coupling) -> None:
+        self.fluid, self.solid, self.comm = fluid, solid, fluid.comm
+        self.blocks: dict[tuple[str, str], PETSc.Mat] = {}
+        surface = solid.surface()
+        self.skin = fluid.immerse(solid.surface_present(), surface.facets)
+        self._take(surface)
+        self._mean = self.skin.last
+        self.theta = THETA.get(fluid.scene.time.integrator, 1.0)
+
+    def _take(self, surface: Surface) -> None:
+        """Take the surface's maps, and their transpose for this rank's unknowns."""
+        layout = self.solid.layout
+        self.surface = surface
+        self._to_unknowns = surface.point_map[:, layout.start : layout.end].T.tocsr()
+
+    def couple(self, time: float, dt: float) -> None:
+        """Bring the surface to where its velocity takes it in the step, and find the forces there. Collective."""
+        surface = self.solid.surface()
+        if surface is not self.surface:
+            self._take(surface)
+        points, velocity = self.solid.surface_present(), self.solid.surface_velocity()
+        if self.fluid.is_moving:
+            points = points + dt * velocity
+        self.skin.place(points, velocity)
+        self.fluid.push(time, dt)
+        self._answer = _Answer(self.fluid, dt if self.fluid.is_moving else 0.0)
+        self.solid.take_mass(self._stiffening())
+
+    def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return this rank's rows of K_w, as far as it counts in this step. Collective."""
+        rows = (self._answer.rows @ self.surface.point_map).tocsr()
+        weighted = rows.multiply(self.theta * self._answer.weight[:, None]).tocsr()
+        product = (rows.T @ weighted).tocoo()
+        self._unknown_rows = rows
+        return gather_triplets(self.comm, self.solid.layout, product.row, product.col, product.data)
+
+    def assemble(self, time: float, dt: float) -> None:
+        """Add the force of the step to the solid's right-hand side, at the velocity that densities saw. Collective."""
+        force = self.skin.to_points(self.skin.force)
+        if self.fluid.is_moving:
+            self._mean = (1 - self.theta) * self.skin.last + self.theta * force
+        else:
+            self._mean = self.skin.last = force
+        self.solid.rhs += self._to_unknowns @ self._mean.ravel()
+        seen = self.skin.velocity.ravel() - self.surface.fixed_map @ self.solid.fixed_velocity()
+        part = self._unknown_rows.T @ (self.theta * self._answer.weight * (self._answer.rows @ seen))
+        here = np.flatnonzero(part)
+        self.solid.rhs += gather_sums(self.comm, self.solid.layout, here, part[here])
+        self.n_assembled += 1
+
+    def inject(self, volume: np.ndarray) -> None:
+        """Do nothing: particles fill no cells."""
+
+    def rewind(self) -> None:
+        """Forget nothing: where the surface is, is asked for in each step."""
+
+    def work(self, pressure: np.ndarray, dt: float) -> Work:
+        """Return what supports did against the force on what they hold, this rank's share: all of it on rank 0."""
+        if not self.surface.fixed_map.nnz or self.comm.rank:
+            return Work()
+        held = self.surface.fixed_map @ self.solid.fixed_velocity()
+        return Work(boundary=-dt * float(self._mean.ravel() @ held))
+
+    def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
+        """Give particles what the new velocity changes, and tell the fluid where the surface is. Collective."""
+        u = np.concatenate(self.comm.allgather(values[self.solid.name]))
+        new = self.surface.point_map @ u + self.surface.fixed_map @ u
+        change = self._answer.give_back(new - self.skin.velocity.ravel())
+        total = np.empty_like(change)
+        self.comm.Allreduce(change, total)
+        total = total.reshape(-1, self.fluid.dim)
+        self._mean = self._mean + self.theta * total
+        self.skin.last = self.skin.to_points(self.skin.force) + total
+        self.restored()
+
+    def restored(self) -> None:
+        """Tell the fluid where the surface is, and how it moves."""
+        self.skin.place(self.solid.surface_present(), self.solid.surface_velocity())
+
+
+#: Part of the force at the end of a step in what the solid gets in it, by integrator; the rest is that at its start.
+#: Particles get half of each: with that momentum is kept to round-off where the scheme gives a force's impulse at once.
+#: Others get that at the end: bdf2 keeps a combination of three steps anyway, and midpoint blows up with halves.
+THETA = {"newmark": 0.5, "symplectic-euler": 0.5}
+
+
+class _Answer:
+    """What the pressure of the particles near a surface answers to its velocity.
+
+    Attributes
+    ----------
+    rows : csr_matrix, shape (n, n_points * dim)
+        E_i of this rank's particles near it, kg/m^2 (by point and axis).
+    weight : ndarray, shape (n,)
+        2 h m_i c_i^2 / rho_i^2.
+    """
+
+    def __init__(self, fluid: SphFluid, dt: float) -> None:
+        self.fluid, skin, swarm, law = fluid, fluid.skin, fluid.swarm, fluid.law
+        assert skin is not None
+        start, other = skin.met.pairs
+        here = np.flatnonzero((np.diff(start) > 0) & swarm.owned)
+        wall, density = skin.met.rows, skin.met.density
+        assert density is not None
+        number = np.diff(start)[here]
+        first = np.concatenate(([0], np.cumsum(number)))
+        use = np.arange(first[-1]) - np.repeat(first[:-1], number) + np.repeat(start[here], number)
+        d, i = other[use], np.repeat(here, number)
+        r = swarm["x"][i] - wall.x[d]
+        _, slope = law.kernel.values(np.sqrt(np.sum(r**2, axis=1)))
+        height = np.sum(r * wall.normal[d], axis=1) - wall.depth[d]
+        seen = np.clip(height / (EDGE * law.spacing), 0.0, 1.0)
+        pull = (density[d] * wall.volume[d] * slope * seen)[:, None] * r
+        self.here, self._sum = here, np.add.reduceat(pull, first[:-1]) if len(here) else np.zeros((0, fluid.dim))
+        corners, weights = skin.facets[skin.facet[skin.rows[d]]], skin.weights[skin.rows[d]]
+        dim = fluid.dim
+        columns = dim * corners[:, :, None] + np.arange(dim)
+        values = weights[:, :, None] * pull[:, None, :]
+        indptr = first * dim * dim
+        shape = len(here), skin.points.size
+        self.rows = csr_matrix((values.ravel(), columns.ravel(), indptr), shape=shape)
+        self.rows.sum_duplicates()
+        rho, m = swarm["rho"][here], swarm["m"][here]
+        self._square = law.c**2 * (rho / law.rho0) ** 6
+        self.weight = 2 * dt * m * self._square / rho**2
+        self._dt = dt
+
+    def give_back(self, change: np.ndarray) -> np.ndarray:
+        """Let particles feel that the points' velocity is another; return what their forces on the points are more.
+
+        Parameters
+        ----------
+        change : ndarray, shape (n_points * dim,)
+            m/s.
+
+        Returns
+        -------
+        ndarray, shape (n_points * dim,)
+            This rank's share, N.
+        """
+        swarm, here = self.fluid.swarm, self.here
+        rise = -self._dt * self._square * (self.rows @ change)
+        rho, m = swarm["rho"][here], swarm["m"][here]
+        swarm["a"][here] -= (2 * rise / rho**2)[:, None] * self._sum
+        part = self.rows.T @ (2 * m * rise / rho**2)
+        swarm["rho"][here] += rise / self._square
+        return part

@@ -1,0 +1,20 @@
+"""Arrays that every rank has, into a file and back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from petfsi.fields.base import Reader, Slab
+
+
+def whole_slab(rank: int, array: np.ndarray) -> Slab:
+    """Return an array that all ranks have as one that rank 0 owns, its length before it."""
+    mine = rank == 0
+    data = np.concatenate(([len(array)], array)) if mine else np.zeros(0)
+    return Slab(data, (0 if mine else 1 + len(array),), (1 + len(array),))
+
+
+def read_whole(read: Reader, name: str) -> np.ndarray:
+    """Return what ``whole_slab`` stored, on every rank. Collective."""
+    n = int(read(name, (0,), (1,))[0])
+    return np.asarray(read(name, (1,), (n,)), dtype=float) if n else np.zeros(0)

@@ -1,0 +1,214 @@
+"""Wall particles behind the surface of solids that move: hung on its facets, they go where these go.
+
+A wall particle of facet f has barycentric coordinates lambda and a depth k dx + dx / 2,
+
+    x_d = y - depth n,     y = sum_a lambda_a X_a,     v_d = sum_a lambda_a U_a,
+
+and stands for its share of the facet's present area times dx. The force on it goes to the facet's points by the same
+lambda, so that nothing is lost on the way. Every rank has all of them; each lists those near its own particles, and
+the owner of the cell that one is in sums what it feels.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from mpi4py import MPI
+from numba import njit
+from scipy.sparse import csr_matrix
+
+from petfsi.fields.sph.cells import CellGrid, PairLists, Pairs, sorted_rows
+from petfsi.fields.sph.particles import Swarm
+from petfsi.fields.sph.passes import FluidRows, Met, Passes, WallRows
+from petfsi.geometry.slabs import area_vectors
+
+
+class Skin:
+    """The wall particles of a surface.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    grid : CellGrid
+        The fluid's.
+    spacing, reach : float
+        Of the fluid's particles, m: there are ceil(reach / spacing) layers.
+    points : ndarray, shape (n_points, dim)
+        Of the surface at the start, m.
+    facets : ndarray of int, shape (n_facets, dim)
+        Normals out of the solid.
+    no_slip : bool
+
+    Attributes
+    ----------
+    points, velocity, acceleration : ndarray, shape (n_points, dim)
+        Of the surface, as last placed.
+    x : ndarray, shape (n, dim)
+        Of all wall particles then.
+    force : ndarray, shape (n, dim)
+        On each of them in the last force pass, N.
+    last : ndarray, shape (n_points, dim)
+        On each point at the end of the last step, N: state.
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, grid: CellGrid, spacing: float, reach: float, points: np.ndarray, facets: np.ndarray,
+        no_slip: bool,
+    ) -> None:  # fmt: skip
+        self.comm, self.grid, self.facets, self._reach = comm, grid, facets, reach
+        area = np.linalg.norm(area_vectors(points, facets), axis=1)
+        facet, weights, share = _samples(points, facets, area, spacing)
+        layers = int(np.ceil(reach / spacing - 1e-9))
+        n = len(facet)
+        self.facet, self.weights = np.repeat(facet, layers), np.repeat(weights, layers, axis=0)
+        self.depth = np.tile((np.arange(layers) + 0.5) * spacing, n)
+        self._thickness = np.repeat(share, layers) * spacing
+        count, dim = len(self.facet), points.shape[1]
+        corners = facets[self.facet]
+        entries = self.weights.ravel(), (corners.ravel(), np.repeat(np.arange(count), dim))
+        self._spread = csr_matrix(entries, shape=(len(points), count))
+        self._no_slip = np.full(count, no_slip)
+        self._period = np.where(grid.periodic, grid.counts * grid.side, 0.0)
+        self.force, self.last = np.zeros((count, dim)), np.zeros_like(points)
+        self._lists = PairLists()
+        self._anchor = points
+        self._met: Met | None = None
+        still = np.zeros_like(points)
+        self.place(points, still, still)
+
+    def place(self, points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray | None = None) -> None:
+        """Bring the surface to a place: all arguments of shape (n_points, dim). Not collective."""
+        self.points, self.velocity = points, velocity
+        if acceleration is not None:
+            self.acceleration = acceleration
+        vectors = area_vectors(points, self.facets)
+        area = np.linalg.norm(vectors, axis=1)
+        normals = vectors / np.where(area > 0.0, area, 1.0)[:, None]
+        self.normal = normals[self.facet]
+        self.x = self.at_feet(points) - self.depth[:, None] * self.normal
+        self._volume = self._thickness * area[self.facet]
+        if self._met is not None:
+            self._met = self._met._replace(rows=self._wall_rows())
+
+    @property
+    def met(self) -> Met:
+        """Rows and pairs of this rank, as last listed."""
+        assert self._met is not None, "pairs have been listed"
+        return self._met
+
+    def at_feet(self, values: np.ndarray) -> np.ndarray:
+        """Return what values of the points (n_points, dim) are where the wall particles hang, shape (n, dim)."""
+        return np.einsum("na,nad->nd", self.weights, values[self.facets[self.facet]])
+
+    def to_points(self, values: np.ndarray) -> np.ndarray:
+        """Return what belongs to wall particles (n, dim) shared out among the points, shape (n_points, dim)."""
+        return self._spread @ values
+
+    def farthest(self) -> float:
+        """Return how far a point has gone since pairs were listed at most, m."""
+        return float(np.sqrt(np.sum((self.points - self._anchor) ** 2, axis=1).max(initial=0.0)))
+
+    def meet(self, fluid: Swarm, reach: float) -> None:
+        """List the pairs with the fluid's particles, which have just been sorted. Not collective."""
+        every, x, cells = self._local(fluid)
+        order, first = sorted_rows(cells - fluid.corner, fluid.counts, every)
+        self.rows, self._shift = every[order], (x - self.x[every])[order]
+        inner = np.all((cells > fluid.corner) & (cells < fluid.corner + fluid.counts - 1), axis=1)
+        self.owned = inner[order]
+        self._anchor = self.points
+        rows = self._wall_rows()
+        feet = rows.x + rows.depth[:, None] * rows.normal
+        pairs = self._lists.wall(fluid["x"], fluid.owned, fluid.first, rows.x, self.owned, first, fluid.counts, reach)
+        slack = reach - self._reach  # until pairs are listed again
+        self._met = Met(rows, Pairs(*_before(*pairs, fluid["x"], feet, rows.normal, slack)), sided=True)
+
+    def _local(self, fluid: Swarm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which wall particles, or their images, are in this rank's cells, where, and in which cells."""
+        found = []
+        for shift in product(*((-1, 0, 1) if p > 0 else (0,) for p in self._period)):
+            x = self.x + np.array(shift) * self._period
+            cells = self.grid.of(x)
+            here = np.all((cells >= fluid.corner) & (cells < fluid.corner + fluid.counts), axis=1)
+            found.append((np.flatnonzero(here), x[here], cells[here]))
+        every, x, cells = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return every, x, cells
+
+    def _wall_rows(self) -> WallRows:
+        rows = self.rows
+        return WallRows(
+            self.x[rows] + self._shift,
+            self.at_feet(self.velocity)[rows],
+            self.at_feet(self.acceleration)[rows],
+            self._volume[rows],
+            np.ascontiguousarray(self.normal[rows]),
+            self.depth[rows],
+            self._no_slip[rows],
+        )
+
+    def press(self, passes: Passes, fluid: FluidRows, p: np.ndarray) -> None:
+        """Take the pressure from the fluid's p (n,). Collective."""
+        pressure, _ = passes.wall_pressure(fluid, p, self.met)
+        pressure = self._gathered(pressure)[self.rows]
+        self._met = self.met._replace(pressure=pressure, density=passes.law.density(pressure))
+
+    def take(self, force: np.ndarray) -> None:
+        """Take this rank's part of the forces of the last pass. Collective."""
+        self.force = self._gathered(force)
+
+    def _gathered(self, values: np.ndarray) -> np.ndarray:
+        """Return on all ranks what the owners of wall particles have of them; zero of those in no one's cells."""
+        every = np.zeros((len(self.x), *values.shape[1:]))
+        every[self.rows[self.owned]] = values[self.owned]
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, every)  # of one that is not zero: no rounding
+        return every
+
+
+def _samples(
+    points: np.ndarray, facets: np.ndarray, area: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points about a spacing apart on facets: the facet of each, its coordinates, its share of the area."""
+    dim = points.shape[1]
+    size = area if dim == 2 else np.sqrt(2 * area)
+    number = np.maximum(1, np.rint(size / spacing)).astype(int)
+    parts = []
+    for m in np.unique(number):
+        weights = _lattice_2d(m) if dim == 2 else _lattice_3d(m)
+        use = np.flatnonzero(number == m)
+        parts.append((np.repeat(use, len(weights)), np.tile(weights, (len(use), 1))))
+    facet, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(facet, kind="stable")
+    share = 1.0 / number ** (dim - 1)
+    return facet[order], weights[order], share[facet[order]]
+
+
+def _lattice_2d(m: int) -> np.ndarray:
+    """Return the middles of m equal parts of a segment, barycentric."""
+    t = (np.arange(m) + 0.5) / m
+    return np.column_stack([1.0 - t, t])
+
+
+def _lattice_3d(m: int) -> np.ndarray:
+    """Return the centroids of m^2 equal parts of a triangle, barycentric."""
+    i, j = (k.ravel() for k in np.mgrid[:m, :m])
+    upright = np.column_stack([i, j])[i + j < m] + 1.0 / 3.0
+    upside = np.column_stack([i, j])[i + j < m - 1] + 2.0 / 3.0
+    st = np.concatenate([upright, upside]) / m
+    return np.column_stack([1.0 - st.sum(axis=1), st])
+
+
+@njit(cache=True)
+def _before(start, other, x, feet, normal, slack):
+    """Return the pairs of particles that are before the facet of the wall particle, or nearly: no other sees it."""
+    kept, n = np.zeros_like(start), 0
+    for i in range(x.shape[0]):
+        for k in range(start[i], start[i + 1]):
+            d, height = other[k], 0.0
+            for axis in range(x.shape[1]):
+                height += (x[i, axis] - feet[d, axis]) * normal[d, axis]
+            if height > -slack:
+                other[n] = d
+                n += 1
+        kept[i + 1] = n
+    return kept, other[:n]
