@@ -298,7 +298,11 @@ class Simulation:
         """Return how often each block was assembled."""
         return {
             **{field.name: field.n_assembled for field in self.system.fields},
-            **{"-".join(next(iter(coupling.blocks))): coupling.n_assembled for coupling in self.couplings},
+            **{
+                "-".join(next(iter(coupling.blocks))): coupling.n_assembled
+                for coupling in self.couplings
+                if coupling.blocks
+            },
         }
 
     def state(self) -> dict[str, dict[str, Slab]]:

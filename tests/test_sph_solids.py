@@ -67,7 +67,7 @@ def frequency(scene):
 def test_a_layer_under_water_swings_with_its_frequency(integrator):
     """Its error is of first order in the spacing: half a row's mass is missing at the wall."""
     w, left = frequency(layer(10, 1.2, integrator, 0.8))
-    assert w == pytest.approx(exact(1.2), rel=0.045)
+    assert w == pytest.approx(exact(1.2), rel=0.05)
     assert 0.95 < left < 1.02
 
 
