@@ -13,6 +13,7 @@ COUPLINGS = {
     "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
     "ray": "petfsi.couplings.ray:RayCoupling",
     "pressure": "petfsi.couplings.particles:PressureTransfer",
+    "repulsion": "petfsi.couplings.repulsion:RepulsionTransfer",
 }
 MATERIALS = {
     "green": "petfsi.fields.solid.materials.green:green",

@@ -332,7 +332,7 @@ def test_a_shipped_scene_passes_its_check(job):
         ("solids.disk.shape.ball.cells=7", "solids.disk.shape.ball.cells = 7: must be a multiple of 2"),
         ("solids.disk.shape.ball.radius=1.05", "solids.disk.shape: overlaps obstacles.container with"),
         ("obstacles.container.shape.ball.cells=8", "obstacles.container.shape.ball.cells = 8: only a solid's ball"),
-        ("coupling.transfer=rays", "coupling.transfer = \"rays\": must be 'cutcell', 'ray' or 'pressure'"),
+        ("coupling.transfer=rays", "coupling.transfer = \"rays\": must be 'cutcell', 'ray', 'pressure' or 'repulsion'"),
     ],
 )
 def test_a_mistake_in_a_round_shape_is_named_with_exit_code_2(setting, said):

@@ -210,7 +210,7 @@ BROKEN = [
     (["time.integrator=static", "solids.layer.initial={}"], 'time.integrator = "static"', "take out the [fluid]"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
     (["output.every=-1"], "output.every = -1", "must be greater than 0 (s)"),
-    (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell', 'ray' or 'pressure'"),
+    (["coupling.transfer=magic"], 'coupling.transfer = "magic"', "must be 'cutcell', 'ray', 'pressure' or 'repulsion'"),
     (["coupling.quadrature=9"], "coupling.quadrature = 9", "must be 4 or less"),
     (["title=3"], "title = 3", "must be a text in quotes"),
     (["gravity.0=true"], "gravity.0 = true", "must be a number or an expression in quotes (m/s^2"),

@@ -66,8 +66,10 @@ class PressureTransfer(Coupling):
             points = points + dt * velocity
         self.skin.place(points, velocity)
         self.fluid.push(time, dt)
-        self._answer = _Answer(self.fluid, dt if self.fluid.is_moving else 0.0)
-        self.solid.take_mass(self._stiffening())
+        # an explicit solid's block is diagonal: its step is short, and it goes without
+        answers = self.fluid.is_moving and not self.solid.explicit
+        self._answer = _Answer(self.fluid, dt if answers else 0.0)
+        self.solid.take_mass(None if self.solid.explicit else self._stiffening())
 
     def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return this rank's rows of K_w, as far as it counts in this step. Collective."""
@@ -81,15 +83,17 @@ class PressureTransfer(Coupling):
         """Add the force of the step to the solid's right-hand side, at the velocity that densities saw. Collective."""
         force = self.skin.to_points(self.skin.force)
         if self.fluid.is_moving:
-            self._mean = (1 - self.theta) * self.skin.last + self.theta * force
+            self._mean = (1 - self.theta) * self.skin.last + self.theta * force + self.skin.impulse / dt
         else:
             self._mean = self.skin.last = force
         self.solid.rhs += self._to_unknowns @ self._mean.ravel()
+        self.n_assembled += 1
+        if self.solid.explicit:
+            return
         seen = self.skin.velocity.ravel() - self.surface.fixed_map @ self.solid.fixed_velocity()
         part = self._unknown_rows.T @ (self.theta * self._answer.weight * (self._answer.rows @ seen))
         here = np.flatnonzero(part)
         self.solid.rhs += gather_sums(self.comm, self.solid.layout, here, part[here])
-        self.n_assembled += 1
 
     def inject(self, volume: np.ndarray) -> None:
         """Do nothing: particles fill no cells."""

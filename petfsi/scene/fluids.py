@@ -116,7 +116,7 @@ class SphFluid(FluidTable):
     """A weakly compressible fluid of particles."""
 
     form: ClassVar[str] = "<sph>"
-    transfers: ClassVar[tuple[str, ...]] = ("pressure",)
+    transfers: ClassVar[tuple[str, ...]] = ("pressure", "repulsion")
 
     spacing: Annotated[Real, Field(gt=0, description="m between particles at the start")]
     smoothing: Annotated[Real, Field(ge=1, le=3, description="smoothing length over the spacing")] = 1.5

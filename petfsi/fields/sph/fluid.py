@@ -25,6 +25,7 @@ from petfsi.fields.sph.cells import PairLists, Pairs
 from petfsi.fields.sph.particles import StrayError, Swarm
 from petfsi.fields.sph.passes import FluidRows, Passes
 from petfsi.fields.sph.room import Room
+from petfsi.fields.sph.sight import Sight, thin_facets, wet_on_both_sides
 from petfsi.fields.sph.skin import Skin
 from petfsi.fields.sph.start import Start, depth_behind, limits
 from petfsi.fields.sph.walls import Walls
@@ -33,6 +34,9 @@ from petfsi.scene.schema import Scene
 
 #: Lists of pairs reach so much farther than particles see: they hold while no two came nearer by as much.
 SKIN = 0.05
+#: Particles that went through a thin body are put back so far before it, in spacings; if more than a few, and more than
+#: one in so many of all, did in one step, the run stops.
+GAP, FEW, MOST = 0.1, 10, 1000
 #: Particles begin so far, in spacings, before solids.
 CLEARANCE = 0.25
 #: What a checkpoint holds besides "id" and "x".
@@ -45,13 +49,18 @@ class SphFluid(FluidField):
     Attributes
     ----------
     swarm : Swarm
-        Columns x, v, rho, m, a (acceleration), S (see ``passes``), anchor (where it was when pairs were listed).
+        Columns x, v, rho, m, a (acceleration), S (see ``passes``), anchor and origin (where it was when pairs were
+        listed, and when the step began).
     passes : Passes
         With the law.
     walls : Walls or None
         Those at rest; None where no side and no obstacle holds the fluid.
     skin : Skin or None
         Those of solids, if a coupling has put any in.
+    sight : Sight or None
+        What bodies thinner than particles see hide.
+    kept, tallied : dict
+        What a coupling wants to find again after a restart, arrays that every rank has; and to say in history.csv.
     pairs : Pairs
         Of particles, as last listed.
     room : Room
@@ -73,7 +82,9 @@ class SphFluid(FluidField):
         self.passes, self._lists = Passes(self.law), PairLists()
         vector = (self.dim, np.float64)
         columns = {"v": vector, "rho": ((), np.float64), "m": ((), np.float64)}
-        self.swarm = Swarm(comm, self.room.grid, {**columns, "a": vector, "S": vector, "anchor": vector})
+        self.swarm = Swarm(
+            comm, self.room.grid, {**columns, "a": vector, "S": vector, "anchor": vector, "origin": vector}
+        )
         rows = start.rows(slice(comm.rank, None, comm.size))
         boxes = bisect(comm, self.room.grid, self.room.grid.of(rows["x"]))
         self.swarm.insert(rows)
@@ -81,6 +92,10 @@ class SphFluid(FluidField):
         dummies = start.dummies()
         self.walls = Walls(comm, self.room.grid, boxes, dummies) if len(dummies.x) else None
         self.skin: Skin | None = None
+        self.sight: Sight | None = None
+        self.n_put_back = 0
+        self.kept: dict[str, np.ndarray] = {}
+        self.tallied: dict[str, float] = {}
         self._notes = start.notes
         self.swarm["a"][:] = self.gravity(0.0)
         self._forget_step()
@@ -96,6 +111,19 @@ class SphFluid(FluidField):
 
         Particles in thin bodies, or next to nothing before a surface, are taken out. Collective.
         """
+        self.clear(points, facets)
+        no_slip = self.law.nu > 0
+        self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, no_slip)
+        reach = (1 + SKIN) * self.room.reach
+        thin = thin_facets(points, facets, reach)
+        if np.any(thin):
+            both = wet_on_both_sides(points, facets, reach)
+            self.sight = Sight(facets, thin, reach, both, self.room.grid)
+        self._listed = False
+        return self.skin
+
+    def clear(self, points: np.ndarray, facets: np.ndarray) -> None:
+        """Take particles out that are inside of a surface, or next to nothing before it, and tell. Collective."""
         near = CLEARANCE * self.spacing
         depth = depth_behind(self.swarm["x"], points, facets, self.room.reach)
         inside = self.swarm.owned & (depth > -near)
@@ -104,10 +132,7 @@ class SphFluid(FluidField):
             self.swarm.remove(inside)
             self.swarm.rebuild()
             self._notes.append(f"fluid.fill: {dropped} places lie in solids, or less than {near:g} m before them")
-        no_slip = self.law.nu > 0
-        self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, no_slip)
         self._listed = False
-        return self.skin
 
     @property
     def is_moving(self) -> bool:
@@ -127,6 +152,8 @@ class SphFluid(FluidField):
         """Kick, drift, take the new density, drift, shift: all but the forces at the end. Collective."""
         swarm, half = self.swarm, dt / 2
         self._way, self._diffused, self._pushed, self._moving = np.zeros(self.dim), 0.0, False, True
+        if self.sight is not None and self.skin is not None:
+            swarm["origin"], self._begin = swarm["x"], self.skin.points
         moves.kick(swarm["v"], swarm["a"], half)
         moves.drift(swarm["x"], swarm["v"], half)
         if self.skin is not None:
@@ -163,6 +190,8 @@ class SphFluid(FluidField):
         if self._pushed:
             return
         end = time + dt if self._moving else time
+        if self._moving:
+            self._guard(dt)
         self._refresh("x", "rho")
         self._weigh(end)
         fluid, sets = self._rows(), self._sets()
@@ -178,6 +207,33 @@ class SphFluid(FluidField):
         self.swarm["a"] = forces.f / fluid.m[:, None] + self.gravity(end)
         self.room.let_go(self.swarm, self.gravity(end), dt)
         self._pushed = True
+
+    def _guard(self, dt: float) -> None:
+        """Put back what has gone through a thin body in the step. Collective.
+
+        Raises
+        ------
+        SolveError
+            On all ranks, if that is more than one in ``MOST`` of all particles.
+        """
+        if self.sight is None or self.skin is None:
+            return
+        swarm, size = self.swarm, self.room.high - self.room.low
+        way = swarm["x"] - swarm["origin"]
+        before = swarm["x"] - (way - self.room.grid.periodic * np.round(way / size) * size)
+        points = self._begin, self.skin.points
+        gap = GAP * self.spacing
+        found = self.sight.crossed(before, swarm["x"], swarm["v"], *points, dt, gap, swarm.owned)
+        number, most = self.comm.allreduce(len(found.rows)), self.comm.allreduce(swarm.n_owned) / MOST
+        if number > max(FEW, most):
+            raise SolveError(
+                f"{number} particles went through thin bodies in a step, more than 1 in {MOST}; a shorter time.dt, a "
+                "larger fluid.sound_speed or a smaller fluid.spacing may help"
+            )
+        lost = swarm["m"][found.rows][:, None] * (swarm["v"][found.rows] - found.v)
+        swarm["x"][found.rows], swarm["v"][found.rows] = found.x, found.v
+        self.skin.knock(found.facets, found.x, lost)
+        self.n_put_back += number
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Kick for the second half of the step. Collective."""
@@ -223,6 +279,9 @@ class SphFluid(FluidField):
             raise SolveError(f"the particles have blown up: {error}") from None
         swarm["anchor"][:] = swarm["x"]
         self.pairs: Pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
+        if self.sight is not None and self.skin is not None:
+            self.sight.place(self.skin.points, swarm["x"])
+            self.pairs = self.sight.strike(self.pairs, swarm["x"])
         for walls in self._sets():
             walls.meet(swarm, reach)
         self._listed = True
@@ -271,8 +330,9 @@ class SphFluid(FluidField):
         return self._notes
 
     def tally(self) -> dict[str, float]:
-        """Return the number of particles. Collective."""
-        return {"particles": float(self.comm.allreduce(self.swarm.n_owned))}
+        """Return the number of particles, and how many were put back where thin bodies are. Collective."""
+        put_back = {} if self.sight is None else {"put_back": float(self.n_put_back)}
+        return {"particles": float(self.comm.allreduce(self.swarm.n_owned))} | put_back | self.tallied
 
     def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
         """Return ``pressure`` or ``velocity`` at a point, ``level`` there, or ``front`` of all. Collective."""
@@ -309,13 +369,16 @@ class SphFluid(FluidField):
     def state(self) -> dict[str, Slab]:
         """Return all that the next step reads, by id. Collective."""
         skin = {} if self.skin is None else {"skin_force": whole_slab(self.comm.rank, self.skin.last.ravel())}
-        return self.swarm.slabs(STORED) | skin
+        kept = {name: whole_slab(self.comm.rank, values.ravel()) for name, values in self.kept.items()}
+        return self.swarm.slabs(STORED) | skin | kept
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
         self.swarm.restore(read, STORED)
         if self.skin is not None:
             self.skin.last = read_whole(read, "skin_force").reshape(-1, self.dim)
+        for name, values in self.kept.items():
+            values[...] = read_whole(read, name).reshape(values.shape)
         self._forget_step()
         self._pushed = True  # a is that of the forces
         self._measure_speeds()

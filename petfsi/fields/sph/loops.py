@@ -102,7 +102,7 @@ def _density_terms(blocks, n_blocks, lanes, kernel, inv_s, diffuses):
 def _seen(height, depth, inv_edge):
     """Return how much a particle so high above a wall row sees of it: all from before the facet, nothing from behind.
 
-    In between it grows over a quarter of a spacing, so that forces have no jumps where a facet ends.
+    In between it grows over a small part of a spacing, so that forces have no jumps where a facet ends.
     """
     return min(max((height - depth) * inv_edge, 0.0), 1.0)
 

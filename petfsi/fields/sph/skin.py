@@ -50,6 +50,8 @@ class Skin:
         On each of them in the last force pass, N.
     last : ndarray, shape (n_points, dim)
         On each point at the end of the last step, N: state.
+    impulse : ndarray, shape (n_points, dim)
+        What points got in the step from particles that were put back, kg m/s.
     """
 
     def __init__(
@@ -70,7 +72,7 @@ class Skin:
         self._spread = csr_matrix(entries, shape=(len(points), count))
         self._no_slip = np.full(count, no_slip)
         self._period = np.where(grid.periodic, grid.counts * grid.side, 0.0)
-        self.force, self.last = np.zeros((count, dim)), np.zeros_like(points)
+        self.force, self.last, self.impulse = np.zeros((count, dim)), np.zeros_like(points), np.zeros_like(points)
         self._lists = PairLists()
         self._anchor = points
         self._met: Met | None = None
@@ -104,6 +106,27 @@ class Skin:
     def to_points(self, values: np.ndarray) -> np.ndarray:
         """Return what belongs to wall particles (n, dim) shared out among the points, shape (n_points, dim)."""
         return self._spread @ values
+
+    def knock(self, facets: np.ndarray, x: np.ndarray, impulse: np.ndarray) -> None:
+        """Take what particles lose that facets throw back, for ``impulse``. Collective.
+
+        Parameters
+        ----------
+        facets : ndarray of int, shape (k,)
+        x : ndarray, shape (k, dim)
+            Where that is, m.
+        impulse : ndarray, shape (k, dim)
+            kg m/s.
+        """
+        corners = self.points[self.facets[facets]]
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        rest = np.einsum("kab,kb->ka", np.linalg.pinv(edges), x - corners[:, 0])
+        weights = np.clip(np.column_stack([1.0 - rest.sum(axis=1), rest]), 0.0, 1.0)
+        weights /= weights.sum(axis=1, keepdims=True)
+        mine = np.zeros_like(self.points)
+        np.add.at(mine, self.facets[facets], weights[:, :, None] * impulse[:, None, :])
+        self.impulse = np.empty_like(mine)
+        self.comm.Allreduce(mine, self.impulse)
 
     def farthest(self) -> float:
         """Return how far a point has gone since pairs were listed at most, m."""
