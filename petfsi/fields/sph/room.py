@@ -113,7 +113,8 @@ class Room:
         """
         x = swarm["x"]
         with np.errstate(invalid="ignore"):
-            out = self._beyond(x, "wall", self.spacing) & swarm.owned
+            # what has left through an open side may be anywhere
+            out = self._beyond(x, "wall", self.spacing) & ~self._beyond(x, "open", 0.0) & swarm.owned
         worst = int(swarm["id"][out].min(initial=np.iinfo(np.int64).max))
         first = comm.allreduce(worst, MPI.MIN)
         if first == np.iinfo(np.int64).max:
