@@ -35,6 +35,9 @@ BENCHES = {
     "solid-speed": Bench(
         "a solid's assembly against products with its matrix; its solve, eight times finer", "4 min", "5 s"
     ),
+    "particles": Bench(
+        "vortices, channels, still water and dams that break, against exact and measured ones", "10 min", "1 min"
+    ),
     "solver": Bench("one solve over density ratio, stiffness, step and grid, against others", "20 min", "20 s"),
 }
 

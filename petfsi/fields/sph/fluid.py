@@ -167,7 +167,7 @@ class SphFluid(FluidField):
         if self.room.shifting:
             columns = swarm["x"], swarm["v"], swarm["S"], swarm["m"], mine
             shifted = np.zeros(self.dim)
-            moves.shift(*columns, dt, self.law.s, shifted)
+            moves.shift(*columns, dt, self.law.s, moves.SLOW * self.law.c, shifted)
             self._diffused += float(shifted @ self.gravity(time + half))
             self._way += shifted
 

@@ -13,6 +13,8 @@ from numba import njit
 EMPTY, FULL = 0.75, 0.95
 #: Shifting moves a particle by this many s h |S| |v|.
 SHIFT = 16.0
+#: Slow is what goes at less than this part of the speed of sound.
+SLOW = 0.01
 
 
 @njit(cache=True)
@@ -32,10 +34,11 @@ def drift(x: np.ndarray, v: np.ndarray, t: float) -> None:
 
 
 @njit(cache=True)
-def shift(x, v, sums, m, owned, h, s, way):
+def shift(x, v, sums, m, owned, h, s, slow, way):
     """Move particles from where they are crowded to where they are not, and add the sum of m times that to ``way``.
 
-    By min(16 s h |S|, h/2) |v| along -S.
+    By min(16 s h |S|, h/2) |v| along -S, and less where particles are slow: in still water shifting would feed the
+    motion that it lives on.
 
     Parameters
     ----------
@@ -43,8 +46,8 @@ def shift(x, v, sums, m, owned, h, s, way):
         ``sums`` is S, 1/m, see ``passes``; fading out towards free surfaces, see ``fade``.
     m : ndarray, shape (n,)
     owned : ndarray of bool, shape (n,)
-    h, s : float
-        The step, s, and the smoothing length, m.
+    h, s, slow : float
+        The step, s; the smoothing length, m; the speed below which they are shifted by |v|/slow times as much, m/s.
     way : ndarray, shape (dim,)
         kg m.
 
@@ -61,7 +64,8 @@ def shift(x, v, sums, m, owned, h, s, way):
         size = np.sqrt(size2)
         if size == 0.0:
             continue
-        factor = -min(SHIFT * s * h, 0.5 * h / size) * np.sqrt(speed2)
+        speed = np.sqrt(speed2)
+        factor = -min(SHIFT * s * h, 0.5 * h / size) * speed * min(1.0, speed / slow)
         for axis in range(dim):
             d = factor * sums[i, axis]
             x[i, axis] += d
