@@ -147,7 +147,8 @@ class Rows:
         rows, passes = self.part(low, high), Passes(self.law)
         met = Met(rows.walls, rows.wall_pairs, rows.p_wall, rows.rho_wall)
         rates = passes.density_rates(rows.fluid, rows.pairs, met)
-        pressure, density = passes.wall_pressure(rows.fluid, rows.p, met)
+        pressure = passes.wall_pressure(rows.fluid, rows.p, met)
+        density = self.law.density(np.maximum(pressure, -0.5 * self.law.B))
         forces = passes.forces(rows.fluid, rows.p, rows.pairs, met)
         fluid = {"total": rates.total, "diffusive": rates.diffusive, "f": forces.f, "S": forces.S}
         fluid["dissipated"] = forces.dissipated

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from petfsi.fields.sph.cells import Pairs, cell_grid, fluid_pairs, sorted_rows, wall_pairs
-from petfsi.fields.sph.sight import Sight, thin_facets, wet_on_both_sides
+from petfsi.fields.sph.sight import Sight
+from petfsi.fields.sph.thin import thin_facets, wet_on_both_sides
 
 DX = 0.05
 REACH = 3.15 * DX

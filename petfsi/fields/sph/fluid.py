@@ -25,9 +25,10 @@ from petfsi.fields.sph.cells import PairLists, Pairs
 from petfsi.fields.sph.particles import StrayError, Swarm
 from petfsi.fields.sph.passes import FluidRows, Passes
 from petfsi.fields.sph.room import Room
-from petfsi.fields.sph.sight import Sight, thin_facets, wet_on_both_sides
+from petfsi.fields.sph.sight import Sight
 from petfsi.fields.sph.skin import Skin
 from petfsi.fields.sph.start import Start, depth_behind, limits
+from petfsi.fields.sph.thin import thin_facets, wet_on_both_sides
 from petfsi.fields.sph.walls import Walls
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene

@@ -139,15 +139,15 @@ class Passes:
             add(*_unsigned(met.pairs), *args, 1 / law.s, law.kernel.f_scale, rates.total)
         return rates
 
-    def wall_pressure(self, fluid: FluidRows, p: np.ndarray, met: Met) -> tuple[np.ndarray, np.ndarray]:
-        """Return pressure (n_d,) Pa and density (n_d,) of wall rows, from the pressure p (n,) of the fluid."""
+    def wall_pressure(self, fluid: FluidRows, p: np.ndarray, met: Met) -> np.ndarray:
+        """Return the pressure (n_d,) Pa of wall rows, from the pressure p (n,) of the fluid; not complete in ghosts."""
         law, walls = self.law, met.rows
         pressure, weight = np.zeros(walls.x.shape[0]), np.zeros(walls.x.shape[0])
         place = (walls.x, walls.a, walls.normal, walls.depth, self._inv_edge)
         average = loops.wall_pressure_loop(*self._which, met.sided)
         args = (fluid.x, fluid.rho, p, *place, np.array(law.gravity), 1 / law.s)
         average(*_unsigned(met.pairs), *args, pressure, weight)
-        return pressure, law.density(pressure)
+        return pressure
 
     def forces(self, fluid: FluidRows, p: np.ndarray, pairs: Pairs, *walls: Met) -> Forces:
         """Return forces, S and dissipation for pressures p (n,) of the fluid, and walls with theirs."""

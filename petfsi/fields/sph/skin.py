@@ -171,7 +171,7 @@ class Skin:
 
     def press(self, passes: Passes, fluid: FluidRows, p: np.ndarray) -> None:
         """Take the pressure from the fluid's p (n,). Collective."""
-        pressure, _ = passes.wall_pressure(fluid, p, self.met)
+        pressure = passes.wall_pressure(fluid, p, self.met)
         pressure = self._gathered(pressure)[self.rows]
         self._met = self.met._replace(pressure=pressure, density=passes.law.density(pressure))
 

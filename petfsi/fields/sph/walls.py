@@ -76,8 +76,9 @@ class Walls:
 
     def press(self, passes: Passes, fluid: FluidRows, p: np.ndarray) -> None:
         """Take the pressure from the fluid's p (n,). Collective."""
-        self._swarm["p"], self._swarm["rho"] = passes.wall_pressure(fluid, p, self.met)
-        self._swarm.exchange("p", "rho")
+        self._swarm["p"] = passes.wall_pressure(fluid, p, self.met)
+        self._swarm.exchange("p")
+        self._swarm["rho"] = passes.law.density(self._swarm["p"])
 
     def take(self, force: np.ndarray) -> None:
         """Take the forces of the last pass."""
