@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 
-if TYPE_CHECKING:
-    from petfsi.fields.sph.fluid import SphFluid
+from petfsi.fields.sph.cells import Pairs
+from petfsi.fields.sph.law import Law
+from petfsi.fields.sph.particles import Swarm
+from petfsi.fields.sph.room import Room
+
+
+class Fluid(Protocol):
+    """What is asked: see ``fluid.SphFluid``."""
+
+    comm: MPI.Comm
+    swarm: Swarm
+    law: Law
+    room: Room
+    spacing: float
+    pairs: Pairs
+
 
 #: What has no more neighbours is spray.
 FEWEST = 3
 
 
-def at_point(fluid: SphFluid, quantity: str, point: np.ndarray) -> float | np.ndarray:
+def at_point(fluid: Fluid, quantity: str, point: np.ndarray) -> float | np.ndarray:
     """Return the pressure (Pa) or velocity (m/s, shape (dim,)) at a point; zero where no particle is near. Collective.
 
     The pressure is that of a wall particle there,  sum W (p + rho g . (point - x)) / sum W.
@@ -38,13 +52,13 @@ def at_point(fluid: SphFluid, quantity: str, point: np.ndarray) -> float | np.nd
     return float(found[0]) if quantity == "pressure" else found
 
 
-def front(fluid: SphFluid) -> float:
+def front(fluid: Fluid) -> float:
     """Return the largest x of the liquid, half a spacing beyond its last particle, m; -inf of none. Collective."""
     found = float(fluid.swarm["x"][_joined(fluid), 0].max(initial=-np.inf))
     return fluid.comm.allreduce(found, MPI.MAX) + fluid.spacing / 2
 
 
-def level(fluid: SphFluid, point: np.ndarray) -> float:
+def level(fluid: Fluid, point: np.ndarray) -> float:
     """Return how high the liquid stands over (or under) a point, against gravity, m; -inf where none does. Collective.
 
     Half a spacing above the highest particle within a spacing of the line through the point.
@@ -58,7 +72,7 @@ def level(fluid: SphFluid, point: np.ndarray) -> float:
     return sense * (fluid.comm.allreduce(found, MPI.MAX) + fluid.spacing / 2)
 
 
-def _joined(fluid: SphFluid) -> np.ndarray:
+def _joined(fluid: Fluid) -> np.ndarray:
     """Return which rows are owned particles with more than ``FEWEST`` neighbours: spray is no liquid."""
     start, other = fluid.pairs
     number = np.diff(start) + np.bincount(other, minlength=len(fluid.swarm))
