@@ -82,11 +82,15 @@ def _mac_skipped(scene: Scene) -> list[str]:
 def _sph(scene: Scene) -> FluidPlan:
     from petfsi.fields.sph.start import Start
 
+    assert isinstance(scene.fluid, SphFluid)
     start, dim = Start(scene), scene.dim
     n, n_walls, law = len(start.x), len(start.dummies().x), start.law
     rows = [("particles", f"{n:,} of {law.spacing:g} m, and {n_walls:,} in walls; no unknowns: they are explicit")]
     limits = ", ".join(f"{name} {limit:.3g} s" for name, limit in start.limits().items())
     rows.append(("sound", f"{law.c:.4g} m/s; limits on the step at the start: {limits}"))
+    hold = "hold back what is drawn away from them" if law.suction else "let go what is drawn away from them"
+    why = "" if scene.fluid.suction is not None else ": no" if law.suction else ": a"
+    rows.append(("walls", hold + (why and f"{why} free surface at the start")))
     rows += [("note", note) for note in start.notes]
     return FluidPlan(rows, 0, float((n + n_walls) * PARTICLE_BYTES[dim]), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
 

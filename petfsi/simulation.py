@@ -242,8 +242,8 @@ class Simulation:
             self.fluid.accept(values.get(self.fluid.name, NOTHING), t, dt)
         if self.regions:
             self.regions.settle()
-        remark = self.solid.remark(dt) if self.solid else None
-        if remark:
+        remarks = self.solid.remark(dt) if self.solid else None, self.fluid.remark() if self.fluid else None
+        for remark in filter(None, remarks):
             self.report(f"t = {t + dt:.6g} s: {remark}")
         self.accounts.update(values.get("pressure"), dt)
 

@@ -1,6 +1,7 @@
 """Kernels, cells, lists and passes of particles against sums over all pairs: 3 s, 30 s before anything is compiled."""
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from petfsi.fields.sph.cells import PairLists, cell_grid, fluid_pairs, sorted_rows, wall_pairs
 from petfsi.fields.sph.kernels import ALPHA, Kernel
 from petfsi.fields.sph.law import Law
-from petfsi.fields.sph.passes import FluidRows, Met, Passes, WallRows
+from petfsi.fields.sph.passes import NEAR, STOP, FluidRows, Met, Passes, WallRows
 
 KERNELS = tuple(ALPHA)
 GRAVITY = {2: (0.7, -9.81), 3: (0.7, 0.3, -9.81)}
@@ -251,7 +252,10 @@ def reference(law, fluid, p, walls, p_wall, rho_wall):
     with np.errstate(divide="ignore"):
         beta = np.where(before > 0, np.minimum(1.5, walls.depth / before), 1.5)
     c = -4 * law.nu * mm * F / (rho[:, None] + rho_wall) * (1 + beta) * walls.no_slip
-    pair = -(mm * (load[:, None] + p_wall / rho_wall**2) * F)[..., None] * r - c[..., None] * u
+    distance = np.linalg.norm(r, axis=2) / (NEAR * law.spacing)
+    least = np.where(distance < 1, STOP * law.c**2 / law.rho0 * (1 - distance), -np.inf)
+    push = np.maximum(load[:, None] + p_wall / rho_wall**2, least)
+    pair = -(mm * push * F)[..., None] * r - c[..., None] * u
     f, lost = f + pair.sum(axis=1), lost + np.sum(c * dot(u, u), axis=1)
     S += np.sum((walls.volume * F * (1 + 0.2 * (W / unit) ** 4))[..., None] * r, axis=1)
     fluid = {"total": total, "diffusive": diffusive, "f": f, "S": S, "dissipated": lost}
@@ -279,6 +283,32 @@ def test_passes_are_the_sums_of_all_pairs(dim, kernel, terms):
     assert np.any(found[0]["diffusive"]) == ("delta" in terms)
     assert np.any(found[0]["dissipated"]) == ("alpha" in terms or "nu" in terms)
     assert np.all(found[0]["dissipated"] >= 0)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_what_is_seen_in_part_counts_in_part(dim):
+    """Halves of everything are everything with half the volume, but for the wall's own density."""
+    case = Rows(dim, delta=0.1)
+    rows, passes = case.part(), Passes(case.law)
+    half = rows.walls._replace(volume=rows.walls.volume / 2)
+    seen = np.full(len(rows.wall_pairs.other), 0.5)
+    found = []
+    for walls, part in ((rows.walls, seen), (half, None)):
+        met = Met(walls, rows.wall_pairs, rows.p_wall, rows.rho_wall, part)
+        forces = passes.forces(rows.fluid, rows.p, rows.pairs, met)
+        found.append((passes.density_rates(rows.fluid, rows.pairs, met).total, forces.f, forces.S, forces.f_walls[0]))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(one).max())
+
+
+def test_walls_without_suction_answer_no_pressure_below_zero():
+    case = Rows(2, suction=False)
+    rows = case.part()
+    met = Met(rows.walls, rows.wall_pairs, rows.p_wall, rows.rho_wall)
+    without = Passes(case.law).wall_pressure(rows.fluid, rows.p, met)
+    with_suction = Passes(replace(case.law, suction=True))
+    assert rows.p.min() < 0 and not np.array_equal(with_suction.wall_pressure(rows.fluid, rows.p, met), without)
+    np.testing.assert_array_equal(with_suction.wall_pressure(rows.fluid, np.maximum(rows.p, 0), met), without)
 
 
 @pytest.mark.parametrize("dim", (2, 3))

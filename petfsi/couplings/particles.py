@@ -25,7 +25,6 @@ from scipy.sparse import csr_matrix
 from petfsi.couplings.base import Coupling
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.sph.fluid import SphFluid
-from petfsi.fields.sph.passes import EDGE
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import gather_sums, gather_triplets
 from petfsi.scene import schema
@@ -155,8 +154,7 @@ class _Answer:
         d, i = other[use], np.repeat(here, number)
         r = swarm["x"][i] - wall.x[d]
         _, slope = law.kernel.values(np.sqrt(np.sum(r**2, axis=1)))
-        height = np.sum(r * wall.normal[d], axis=1) - wall.depth[d]
-        seen = np.clip(height / (EDGE * law.spacing), 0.0, 1.0)
+        seen = np.ones(len(use)) if skin.met.seen is None else skin.met.seen[use]
         pull = (density[d] * wall.volume[d] * slope * seen)[:, None] * r
         self.here, self._sum = here, np.add.reduceat(pull, first[:-1]) if len(here) else np.zeros((0, fluid.dim))
         corners, weights = skin.facets[skin.facet[skin.rows[d]]], skin.weights[skin.rows[d]]

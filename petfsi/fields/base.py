@@ -254,6 +254,10 @@ class FluidField(Field):
         """What a user should know of how it begins."""
         return []
 
+    def remark(self) -> str | None:
+        """Return what a user should know of the step just taken, the same on all ranks; each is told once."""
+        return None
+
 
 class PressureFluid(FluidField):
     """A fluid whose unknown is the pressure, and whose row of the system is the net outflow of a cell.

@@ -45,7 +45,7 @@ MAX_STEPS = 10**8
 RESERVED_PROBES = (
     "step", "time", "dt", "iterations", "residual", "newton", "substeps", "volume_error", "divergence",
     "region_volume", "momentum", "kinetic", "elastic", "potential", "dissipated", "load_work", "boundary_work",
-    "energy_residual",
+    "energy_residual", "particles", "put_back", "particles_behind", "mass", "mass_in", "mass_out",
 )  # fmt: skip
 
 
@@ -83,6 +83,8 @@ def _names(scene: Scene) -> Problems:
                 yield Problem(f"{table}.{name}", ABSENT, "a name must be made of letters, digits and _, no digit first")
     if "fluid" in scene.solids:
         yield Problem("solids.fluid", ABSENT, "the name 'fluid' means the fluid; call the solid something else")
+    for name in scene.obstacles.keys() & {side for pair in OPPOSITE for side in pair}:
+        yield Problem(f"obstacles.{name}", ABSENT, f"'{name}' is a side of the fluid; call the obstacle something else")
     for name in scene.probes.keys() & set(RESERVED_PROBES):
         yield Problem(f"probes.{name}", ABSENT, f"'{name}' is a column of history.csv; call the probe something else")
 

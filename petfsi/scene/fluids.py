@@ -121,11 +121,12 @@ class SphFluid(FluidTable):
     spacing: Annotated[Real, Field(gt=0, description="m between particles at the start")]
     smoothing: Annotated[Real, Field(ge=1, le=3, description="smoothing length over the spacing")] = 1.5
     kernel: Literal["wendland", "quadratic", "cubic"] = "wendland"
-    sound_speed: Annotated[Real | None, Field(gt=0, description="m/s")] = None
+    sound_speed: Annotated[Real | None, Field(gt=0, le=1e6, description="m/s")] = None
     viscosity: Annotated[Real, Field(ge=0, description="Pa s")] = 0.0
     artificial_viscosity: Annotated[Real | None, Field(ge=0, description="Monaghan's alpha")] = None
     density_diffusion: Annotated[Real, Field(ge=0, le=1, description="delta of delta-SPH; 0 is none")] = 0.1
     shifting: Flag = True
+    suction: Annotated[Flag | None, Field(description="whether walls hold back what is drawn away from them")] = None
     fill: Annotated[list[Shape], Field(min_length=1, description="where liquid is at the start")]
     pressure: Annotated[Literal["hydrostatic", "none"], Field(description="at the start")] = "hydrostatic"
     sides: ParticleSides = ParticleSides()

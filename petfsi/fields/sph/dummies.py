@@ -11,7 +11,7 @@ Every place behind several walls belongs to one: to a side, else to the first ob
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -286,16 +286,55 @@ def _from_facets(
     solid: Solid, earlier: list[Solid], domain: Domain, dx: float, layers: int
 ) -> tuple[Array, Array, Array, Array]:
     """Return dummies behind any surface, in layers: x, volume, normal, depth."""
-    dim, fine, deep = len(domain.low), FINE[len(domain.low)], layers * dx
+    dim, deep = len(domain.low), layers * dx
     points, cell = _near(solid, domain, dx, layers)
-    side = dx / fine
-    depth, normal = solid.depth(domain.clamped(points), deep + dx, far=False)
-    within = (depth > -0.5 * side) & (depth < deep + 0.5 * side)
-    points, cell, depth, normal = (part[within] for part in (points, cell, depth, normal))
+    side = dx / FINE[dim]
+
+    def measure(x: Array) -> tuple[Array, Array]:
+        return solid.depth(domain.clamped(x), deep + dx, far=False)
+
+    def allowed(x: Array) -> Array:
+        free = np.all(domain.beyond(x) == 0.0, axis=1)
+        for other in earlier:
+            free &= other.depth(domain.clamped(x), SAME * dx, whole=True)[0] < 0.0
+        return free
+
     if len(solid.corners) < len(solid.whole[0]):  # what is behind the rest may be before these
         cell = cell * (solid.depth(domain.clamped(points), deep + dx, whole=True)[0] > -0.5 * side)
     for other in earlier:
         cell = cell * np.clip(0.5 - other.depth(domain.clamped(points), side, whole=True)[0] / side, 0.0, 1.0)
+    return in_layers(points, cell, dx, layers, measure, allowed)
+
+
+def in_layers(
+    points: Array,
+    cell: Array,
+    dx: float,
+    layers: int,
+    measure: Callable[[Array], tuple[Array, Array]],
+    allowed: Callable[[Array], Array] | None = None,
+) -> tuple[Array, Array, Array, Array]:
+    """Return dummies in layers behind a surface: x, volume, normal, depth.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, dim)
+        A fine lattice, FINE cells along dx, near the surface on both of its sides, m.
+    cell : ndarray, shape (n,)
+        What each stands for, m^dim.
+    dx : float
+        m.
+    layers : int
+    measure : callable
+        Gives how deep places lie behind the surface, and its normal there.
+    allowed : callable, optional
+        Gives in which places a dummy may be.
+    """
+    dim, deep = points.shape[1], layers * dx
+    side = dx / FINE[dim]
+    depth, normal = measure(points)
+    within = (depth > -0.5 * side) & (depth < deep + 0.5 * side)
+    points, cell, depth, normal = (part[within] for part in (points, cell, depth, normal))
     found_x, found_volume, wanted = [np.zeros((0, dim))], [np.zeros(0)], [np.zeros(0)]
     for k in range(layers):
         # how much of a fine cell lies in the layer: its depths spread by about its side
@@ -308,13 +347,12 @@ def _from_facets(
         found_volume.append(volume)
         wanted.append(np.full(len(x), (k + 0.5) * dx))
     x, volume, target = (np.concatenate(part) for part in (found_x, found_volume, wanted))
-    depth, normal = solid.depth(domain.clamped(x), deep + dx, far=False)
+    depth, normal = measure(x)
     moved = x + (depth - target)[:, None] * normal
-    new, new_normal = solid.depth(domain.clamped(moved), deep + dx, far=False)
+    new, new_normal = measure(moved)
     better = np.abs(new - target) < np.abs(depth - target)
-    better &= np.all(domain.beyond(moved) == 0.0, axis=1)
-    for other in earlier:
-        better &= other.depth(domain.clamped(moved), SAME * dx, whole=True)[0] < 0.0
+    if allowed is not None:
+        better &= allowed(moved)
     x[better], depth[better], normal[better] = moved[better], new[better], new_normal[better]
     kept = np.isfinite(depth) & (depth > 0.0)
     return x[kept], volume[kept], normal[kept], depth[kept]

@@ -40,6 +40,8 @@ SKIN = 0.05
 GAP, FEW, MOST = 0.1, 10, 1000
 #: Particles begin so far, in spacings, before solids.
 CLEARANCE = 0.25
+#: Speeds above this part of that of sound, and densities off by more than this part, are remarked on.
+FAST, DENSE = 0.2, 0.05
 #: What a checkpoint holds besides "id" and "x".
 STORED = ("v", "rho", "m", "a", "S")
 
@@ -97,8 +99,9 @@ class SphFluid(FluidField):
         self.n_put_back = 0
         self.kept: dict[str, np.ndarray] = {}
         self.tallied: dict[str, float] = {}
-        self._notes = start.notes
+        self._notes, self._taken = start.notes, dummies.x
         self.swarm["a"][:] = self.gravity(0.0)
+        self._warned = False
         self._forget_step()
         self._measure_speeds()
 
@@ -113,10 +116,10 @@ class SphFluid(FluidField):
         Particles in thin bodies, or next to nothing before a surface, are taken out. Collective.
         """
         self.clear(points, facets)
-        no_slip = self.law.nu > 0
-        self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, no_slip)
         reach = (1 + SKIN) * self.room.reach
         thin = thin_facets(points, facets, reach)
+        about = thin, self.law.nu > 0, self._taken
+        self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, *about)
         if np.any(thin):
             both = wet_on_both_sides(points, facets, reach)
             self.sight = Sight(facets, thin, reach, both, self.room.grid)
@@ -176,6 +179,8 @@ class SphFluid(FluidField):
         """Take the density to the end of the step. Collective."""
         swarm, mine = self.swarm, self.swarm.owned
         self._weigh(time)
+        if self.skin is not None:
+            self.skin.look(self.swarm["x"])
         rates = self.passes.density_rates(self._rows(), self.pairs, *(walls.met for walls in self._sets()))
         rho = swarm["rho"][mine]
         power = swarm["m"][mine] * self.law.pressure(rho) / rho**2 @ rates.diffusive[mine]
@@ -197,6 +202,8 @@ class SphFluid(FluidField):
         self._weigh(end)
         fluid, sets = self._rows(), self._sets()
         p = self.law.pressure(fluid.rho)
+        if self.skin is not None:
+            self.skin.look(fluid.x)
         for walls in sets:
             walls.press(self.passes, fluid, p)
         forces = self.passes.forces(fluid, p, self.pairs, *(walls.met for walls in sets))
@@ -292,15 +299,31 @@ class SphFluid(FluidField):
     def _measure_speeds(self) -> None:
         """Find the largest speed and acceleration. Collective."""
         swarm = self.swarm
-        found = np.array([moves.fastest(swarm[name], swarm.owned) for name in ("v", "a")])
+        found = np.array([*(moves.fastest(swarm[name], swarm.owned) for name in ("v", "a")), self._densest()])
         found[np.isnan(found)] = np.inf
         self.comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
-        self._fastest, self._strongest = found.tolist()
+        self._fastest, self._strongest, self._dense = found.tolist()
         if not np.isfinite(self._fastest + self._strongest):
             raise SolveError(
                 "the particles have blown up: a velocity or an acceleration is not a finite number; a shorter time.dt "
                 "or a larger fluid.sound_speed may help"
             )
+
+    def _densest(self) -> float:
+        """Return how far a density is from that at no pressure at most, over that; of this rank."""
+        rho = self.swarm["rho"][self.swarm.owned]
+        return float(np.abs(rho / self.law.rho0 - 1.0).max(initial=0.0))
+
+    def remark(self) -> str | None:
+        """Return that particles are too fast for the sound, or too dense, when they first are."""
+        slow = f"fluid.sound_speed = {self.law.c:.3g} m/s is too low for that, and more makes the water stiffer"
+        if self._fastest > FAST * self.law.c and not self._warned:
+            self._warned = True
+            return f"particles move at {self._fastest:.3g} m/s: {slow}"
+        if self._dense > DENSE and not self._warned:
+            self._warned = True
+            return f"the density of a particle is off by {100 * self._dense:.2g}%: {slow}"
+        return None
 
     def stable_step(self) -> float:
         """Return the smallest of the limits on the step, s."""

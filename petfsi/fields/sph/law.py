@@ -31,6 +31,8 @@ class Law:
         What pressure balances, m/s^2, ``dim`` numbers.
     alpha, nu, delta : float
         Artificial viscosity (1), kinematic viscosity (m^2/s), diffusion of density (1); 0 leaves the term out.
+    suction : bool
+        Whether walls hold back what is drawn away from them; else they answer no pressure below zero.
     """
 
     dim: int
@@ -43,6 +45,7 @@ class Law:
     alpha: float = 0.0
     nu: float = 0.0
     delta: float = 0.0
+    suction: bool = True
 
     def __post_init__(self):
         if len(self.gravity) != self.dim:

@@ -98,35 +98,24 @@ def _density_terms(blocks, n_blocks, lanes, kernel, inv_s, diffuses):
                 blocks[block, FLUX + lane] = f * blocks[block, RISE + lane]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def _seen(height, depth, inv_edge):
-    """Return how much a particle so high above a wall row sees of it: all from before the facet, nothing from behind.
-
-    In between it grows over a small part of a spacing, so that forces have no jumps where a facet ends.
-    """
-    return min(max((height - depth) * inv_edge, 0.0), 1.0)
-
-
 @functools.cache
 def wall_density_loop(dim: int, kernel: int, sided: bool):
-    """Return the pass of pairs with walls that adds to the rates of density; ``sided`` walls are seen from before."""
+    """Return the pass of pairs with walls that adds to the rates of density; of ``sided`` walls, the part seen."""
 
     @njit(cache=True, error_model="numpy")
-    def wall_density(start, other, rows, x, v, volume, normal, depth, inv_edge, inv_s, f_scale, total):
+    def wall_density(start, other, rows, x, v, volume, seen, inv_s, f_scale, total):
         for i in range(total.size):
             added = 0.0
             for k in range(start[i], start[i + np.uint64(1)]):
                 d = other[k]
-                r2 = ur = height = 0.0
+                r2 = ur = 0.0
                 for a in range(dim):
                     r = rows[i, X + a] - x[d, a]
                     r2 += r * r
                     ur += (rows[i, V + a] - v[d, a]) * r
-                    if sided:
-                        height += r * normal[d, a]
                 w, f = shape(kernel, np.sqrt(r2) * inv_s)
                 if sided:
-                    f *= _seen(height, depth[d], inv_edge)
+                    f *= seen[k]
                 added += volume[d] * f * ur
             total[i] += added * rows[i, RHO] * f_scale
 
@@ -138,22 +127,18 @@ def wall_pressure_loop(dim: int, kernel: int, sided: bool):
     """Return the pass that averages the fluid's pressure, continued to the wall rows."""
 
     @njit(cache=True, error_model="numpy")
-    def wall_pressure(
-        start, other, x, rho, p, x_wall, a_wall, normal, depth, inv_edge, g, inv_s, pressure, weight
-    ):  # fmt: skip
+    def wall_pressure(start, other, x, rho, p, x_wall, a_wall, seen, g, inv_s, pressure, weight):
         for i in range(rho.size):
             for k in range(start[i], start[i + np.uint64(1)]):
                 d = other[k]
-                r2 = rise = height = 0.0
+                r2 = rise = 0.0
                 for a in range(dim):
                     r = x_wall[d, a] - x[i, a]
                     r2 += r * r
                     rise += (g[a] - a_wall[d, a]) * r
-                    if sided:
-                        height -= r * normal[d, a]
                 w, f = shape(kernel, np.sqrt(r2) * inv_s)
                 if sided:
-                    w *= _seen(height, depth[d], inv_edge)
+                    w *= seen[k]
                 pressure[d] += w * (p[i] + rho[i] * rise)
                 weight[d] += w
         for d in range(pressure.size):
@@ -293,8 +278,8 @@ def wall_force_loop(dim: int, kernel: int, sided: bool):
 
     @njit(cache=True, error_model="numpy")
     def wall_force(
-        start, other, rows, scaled, x, v, normal, depth, inv_edge, no_slip, scaled_wall, rho_wall, volume,
-        inv_s, f_scale, w_unit, nu4, sums, f_wall,
+        start, other, rows, scaled, x, v, normal, depth, seen, no_slip, scaled_wall, rho_wall, volume, inv_s,
+        f_scale, w_unit, nu4, near, stop, sums, f_wall,
     ):  # fmt: skip
         r, u = np.zeros(dim), np.zeros(dim)
         for i in range(scaled.size):
@@ -309,9 +294,12 @@ def wall_force_loop(dim: int, kernel: int, sided: bool):
                 w, f = shape(kernel, np.sqrt(r2) * inv_s)
                 f *= f_scale
                 if sided:
-                    f *= _seen(height, depth[d], inv_edge)
+                    f *= seen[k]
                 mm = mass * (volume[d] * rho_wall[d]) * f
-                push, drag = mm * (scaled[i] + scaled_wall[d]), 0.0
+                push, drag = scaled[i] + scaled_wall[d], 0.0
+                if r2 < near * near:
+                    push = max(push, stop * (1.0 - np.sqrt(r2) / near))
+                push *= mm
                 if nu4 > 0.0 and no_slip[d]:
                     # beta: depth behind the wall over the distance before it, which must not be too small
                     before = height - depth[d]
@@ -329,6 +317,38 @@ def wall_force_loop(dim: int, kernel: int, sided: bool):
                     sums[i, S + a] += shift * r[a]
 
     return wall_force
+
+
+@functools.cache
+def seen_loop(dim: int, n_bounds: int):
+    """Return the pass that finds how much a particle sees of wall rows: of sided ones through their own face alone.
+
+    All from before the facet, where the straight way to it crosses the face within its rims, else nothing; in between
+    it grows over a small part of a spacing, so that forces have no jumps there.
+    """
+
+    @njit(cache=True, error_model="numpy")
+    def part_seen(start, other, x, x_wall, normal, depth, sided, outward, limit, inv_edge, seen):
+        for i in range(x.shape[0]):
+            for k in range(start[i], start[i + np.uint64(1)]):
+                d = other[k]
+                seen[k] = 1.0
+                if not sided[d]:
+                    continue
+                height = -depth[d]
+                for a in range(dim):
+                    height += (x[i, a] - x_wall[d, a]) * normal[d, a]
+                part = min(max(height * inv_edge, 0.0), 1.0)
+                if part > 0.0:
+                    t = height / (height + depth[d])
+                    for b in range(n_bounds):
+                        beyond = -limit[d, b]
+                        for a in range(dim):
+                            beyond += (x[i, a] + t * (x_wall[d, a] - x[i, a])) * outward[d, b, a]
+                        part *= min(max(0.5 - beyond * inv_edge, 0.0), 1.0)
+                seen[k] = part
+
+    return part_seen
 
 
 @njit(cache=True, error_model="numpy")

@@ -8,7 +8,8 @@ With r = x_i - x_j, v_ij = v_i - v_j, V = m/rho, F = W'(r)/r and L(p, rho) = p/r
     c_ij = -4 nu m_i m_j F/(rho_i + rho_j) >= 0                             fluid, and walls without slip
     S_i  = sum V_j F r (1 + 0.2 (W/W(dx))^4)                                walls included
     full = -sum V_j F r^2 / dim                                             walls included; 1 inside
-    p_d  = sum W (p_f + rho_f (g - a_d).(x_d - x_f)) / sum W                0 where no fluid is seen
+    p_d  = sum W (p_f + rho_f (g - a_d).(x_d - x_f)) / sum W                0 where no fluid is seen; where walls have
+                                                                            no suction, p_f counts as 0 below that
 
 Each pair is visited once and adds to both of its rows, in the order of rows. Ghost rows in between change neither the
 order nor the pairs that an owned row takes part in, and the loops keep to IEEE arithmetic as written (no fastmath), so
@@ -32,8 +33,9 @@ from petfsi.fields.sph import loops
 from petfsi.fields.sph.cells import Pairs
 from petfsi.fields.sph.law import Law
 
-#: Over so many spacings above its facet a wall particle that is seen from before comes into sight.
-EDGE = 0.25
+#: Nearer than so many spacings to a wall particle, which none is that flows along a wall, a particle is pushed away at
+#: least as by so much of rho c^2: spray, whose pressure may be far below zero, would be drawn through the wall.
+NEAR, STOP = 0.9, 0.2
 
 
 class FluidRows(NamedTuple):
@@ -63,14 +65,15 @@ class WallRows(NamedTuple):
 class Met(NamedTuple):
     """A set of wall rows, the pairs of fluid rows with them, and, once known, their pressure (Pa) and density.
 
-    ``sided`` ones are seen from before their facets alone: bodies may be thinner than particles see.
+    ``seen``, of as many entries as there are pairs, is how much of the wall row the fluid row sees, 0 to 1; without it
+    all.
     """
 
     rows: WallRows
     pairs: Pairs
     pressure: np.ndarray | None = None
     density: np.ndarray | None = None
-    sided: bool = False
+    seen: np.ndarray | None = None
 
 
 class Rates(NamedTuple):
@@ -119,10 +122,6 @@ class Passes:
         self._force = loops.force_loop(*which, law.alpha > 0, law.nu > 0)
         self._rows, self._sums, self._scaled = np.empty((0, 8)), np.empty((0, 8)), np.empty(0)
 
-    @property
-    def _inv_edge(self) -> float:
-        return 1 / (EDGE * self.law.spacing)
-
     def density_rates(self, fluid: FluidRows, pairs: Pairs, *walls: Met) -> Rates:
         """Return D (n,), from the fluid's pairs and those with walls."""
         law = self.law
@@ -134,8 +133,8 @@ class Passes:
         self._density(*_unsigned(pairs), rows, 1 / law.s, law.kernel.f_scale, diffusion, g, loops.LANES, *rates)
         for met in walls:
             wall = met.rows
-            args = (rows, wall.x, wall.v, wall.volume, wall.normal, wall.depth, self._inv_edge)
-            add = loops.wall_density_loop(*self._which, met.sided)
+            args = (rows, wall.x, wall.v, wall.volume, _parts(met))
+            add = loops.wall_density_loop(*self._which, met.seen is not None)
             add(*_unsigned(met.pairs), *args, 1 / law.s, law.kernel.f_scale, rates.total)
         return rates
 
@@ -143,9 +142,9 @@ class Passes:
         """Return the pressure (n_d,) Pa of wall rows, from the pressure p (n,) of the fluid; not complete in ghosts."""
         law, walls = self.law, met.rows
         pressure, weight = np.zeros(walls.x.shape[0]), np.zeros(walls.x.shape[0])
-        place = (walls.x, walls.a, walls.normal, walls.depth, self._inv_edge)
-        average = loops.wall_pressure_loop(*self._which, met.sided)
-        args = (fluid.x, fluid.rho, p, *place, np.array(law.gravity), 1 / law.s)
+        average = loops.wall_pressure_loop(*self._which, met.seen is not None)
+        p = p if law.suction else np.maximum(p, 0.0)
+        args = (fluid.x, fluid.rho, p, walls.x, walls.a, _parts(met), np.array(law.gravity), 1 / law.s)
         average(*_unsigned(met.pairs), *args, pressure, weight)
         return pressure
 
@@ -164,9 +163,10 @@ class Passes:
             assert met.pressure is not None and met.density is not None, "walls come with their pressure and density"
             wall, f_wall = met.rows, np.zeros_like(met.rows.x)
             state = (met.pressure / met.density**2, met.density, wall.volume)
-            place = (wall.x, wall.v, wall.normal, wall.depth, self._inv_edge, wall.no_slip)
-            add = loops.wall_force_loop(*self._which, met.sided)
-            add(*_unsigned(met.pairs), rows, scaled, *place, *state, *constants, 4 * law.nu, sums, f_wall)
+            place = (wall.x, wall.v, wall.normal, wall.depth, _parts(met), wall.no_slip)
+            add = loops.wall_force_loop(*self._which, met.seen is not None)
+            stop = NEAR * law.spacing, STOP * law.c**2 / law.rho0
+            add(*_unsigned(met.pairs), rows, scaled, *place, *state, *constants, 4 * law.nu, *stop, sums, f_wall)
             f_walls.append(f_wall)
         f, S, dissipated, full = np.empty((n, law.dim)), np.empty((n, law.dim)), np.empty(n), np.empty(n)
         loops.unpack(sums, f, S, dissipated, full)
@@ -180,6 +180,10 @@ class Passes:
             self._rows, self._sums, self._scaled = np.empty((more, 8)), np.empty((more, 8)), np.empty(more)
         loops.pack(fluid.x, fluid.v, fluid.rho, fluid.m, self._rows)
         return n
+
+
+def _parts(met: Met) -> np.ndarray:
+    return np.empty(0) if met.seen is None else met.seen
 
 
 def _unsigned(pairs):

@@ -19,9 +19,15 @@ from numba import njit
 from scipy.sparse import csr_matrix
 
 from petfsi.fields.sph.cells import CellGrid, PairLists, Pairs, sorted_rows
+from petfsi.fields.sph.hung import hang
+from petfsi.fields.sph.loops import seen_loop
 from petfsi.fields.sph.particles import Swarm
 from petfsi.fields.sph.passes import FluidRows, Met, Passes, WallRows
+from petfsi.fields.sph.rims import Rims, unit_normals
 from petfsi.geometry.slabs import area_vectors
+
+#: Over so many spacings above its facet a wall particle comes into sight.
+EDGE = 0.25
 
 
 class Skin:
@@ -38,7 +44,11 @@ class Skin:
         Of the surface at the start, m.
     facets : ndarray of int, shape (n_facets, dim)
         Normals out of the solid.
+    thin : ndarray of bool, shape (n_facets,)
+        Those of bodies thinner than particles see.
     no_slip : bool
+    taken : ndarray, shape (n_taken, dim)
+        Where wall particles at rest are, m.
 
     Attributes
     ----------
@@ -56,21 +66,18 @@ class Skin:
 
     def __init__(
         self, comm: MPI.Comm, grid: CellGrid, spacing: float, reach: float, points: np.ndarray, facets: np.ndarray,
-        no_slip: bool,
+        thin: np.ndarray, no_slip: bool, taken: np.ndarray,
     ) -> None:  # fmt: skip
         self.comm, self.grid, self.facets, self._reach = comm, grid, facets, reach
-        area = np.linalg.norm(area_vectors(points, facets), axis=1)
-        facet, weights, share = _samples(points, facets, area, spacing)
-        layers = int(np.ceil(reach / spacing - 1e-9))
-        n = len(facet)
-        self.facet, self.weights = np.repeat(facet, layers), np.repeat(weights, layers, axis=0)
-        self.depth = np.tile((np.arange(layers) + 0.5) * spacing, n)
-        self._thickness = np.repeat(share, layers) * spacing
+        self._rims = Rims(points, facets)
+        self._hung = hung = hang(points, facets, thin, self._rims, spacing, reach, taken)
+        self.facet, self.weights, self.depth = hung.facet, hung.weights, hung.depth
         count, dim = len(self.facet), points.shape[1]
         corners = facets[self.facet]
         entries = self.weights.ravel(), (corners.ravel(), np.repeat(np.arange(count), dim))
         self._spread = csr_matrix(entries, shape=(len(points), count))
         self._no_slip = np.full(count, no_slip)
+        self._inv_edge = 1.0 / (EDGE * spacing)
         self._period = np.where(grid.periodic, grid.counts * grid.side, 0.0)
         self.force, self.last, self.impulse = np.zeros((count, dim)), np.zeros_like(points), np.zeros_like(points)
         self._lists = PairLists()
@@ -78,18 +85,21 @@ class Skin:
         self._met: Met | None = None
         still = np.zeros_like(points)
         self.place(points, still, still)
+        feet = self.x + self.depth[:, None] * self.normal
+        self._bounds = self._rims.bounds(points, feet, self.facet, spacing, reach)
+        self._bounds[~hung.sided] = -1
 
     def place(self, points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray | None = None) -> None:
         """Bring the surface to a place: all arguments of shape (n_points, dim). Not collective."""
         self.points, self.velocity = points, velocity
         if acceleration is not None:
             self.acceleration = acceleration
-        vectors = area_vectors(points, self.facets)
-        area = np.linalg.norm(vectors, axis=1)
-        normals = vectors / np.where(area > 0.0, area, 1.0)[:, None]
-        self.normal = normals[self.facet]
+        area = np.linalg.norm(area_vectors(points, self.facets), axis=1)
+        self.normal, self._outward = unit_normals(points, self.facets)[self.facet], self._rims.outward(points)
         self.x = self.at_feet(points) - self.depth[:, None] * self.normal
-        self._volume = self._thickness * area[self.facet]
+        past = np.flatnonzero(self._hung.rim >= 0)
+        self.x[past] += self._hung.way[past, None] * self._outward[self._hung.rim[past]]
+        self._volume = self._hung.share * area[self.facet] + self._hung.fixed
         if self._met is not None:
             self._met = self._met._replace(rows=self._wall_rows())
 
@@ -144,7 +154,28 @@ class Skin:
         feet = rows.x + rows.depth[:, None] * rows.normal
         pairs = self._lists.wall(fluid["x"], fluid.owned, fluid.first, rows.x, self.owned, first, fluid.counts, reach)
         slack = reach - self._reach  # until pairs are listed again
-        self._met = Met(rows, Pairs(*_before(*pairs, fluid["x"], feet, rows.normal, slack)), sided=True)
+        sided = self._hung.sided[self.rows]
+        if not self._hung.sided.any():
+            self._met = Met(rows, pairs)
+            return
+        pairs = Pairs(*_before(*pairs, fluid["x"], feet, rows.normal, sided, slack))
+        self._met = Met(rows, pairs, seen=np.empty(len(pairs.other)))
+
+    def look(self, x: np.ndarray) -> None:
+        """Find how much fluid rows at x (n, dim) see of the wall rows near them. Not collective."""
+        met, bounds = self.met, self._bounds[self.rows]
+        if met.seen is None:
+            return
+        wall, which = met.rows, np.maximum(bounds, 0)
+        if len(self._outward):
+            outward = self._outward[which]
+            end = self.points[self._rims.ends[which, 0]] + self._shift[:, None]
+        else:
+            outward = end = np.zeros((*which.shape, x.shape[1]))
+        limit = np.where(bounds < 0, np.inf, np.sum(end * outward, axis=2))
+        find = seen_loop(x.shape[1], bounds.shape[1])
+        sided = self._hung.sided[self.rows]
+        find(*met.pairs, x, wall.x, wall.normal, wall.depth, sided, outward, limit, self._inv_edge, met.seen)
 
     def _local(self, fluid: Swarm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return which wall particles, or their images, are in this rank's cells, where, and in which cells."""
@@ -188,49 +219,16 @@ class Skin:
         return every
 
 
-def _samples(
-    points: np.ndarray, facets: np.ndarray, area: np.ndarray, spacing: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points about a spacing apart on facets: the facet of each, its coordinates, its share of the area."""
-    dim = points.shape[1]
-    size = area if dim == 2 else np.sqrt(2 * area)
-    number = np.maximum(1, np.rint(size / spacing)).astype(int)
-    parts = []
-    for m in np.unique(number):
-        weights = _lattice_2d(m) if dim == 2 else _lattice_3d(m)
-        use = np.flatnonzero(number == m)
-        parts.append((np.repeat(use, len(weights)), np.tile(weights, (len(use), 1))))
-    facet, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.argsort(facet, kind="stable")
-    share = 1.0 / number ** (dim - 1)
-    return facet[order], weights[order], share[facet[order]]
-
-
-def _lattice_2d(m: int) -> np.ndarray:
-    """Return the middles of m equal parts of a segment, barycentric."""
-    t = (np.arange(m) + 0.5) / m
-    return np.column_stack([1.0 - t, t])
-
-
-def _lattice_3d(m: int) -> np.ndarray:
-    """Return the centroids of m^2 equal parts of a triangle, barycentric."""
-    i, j = (k.ravel() for k in np.mgrid[:m, :m])
-    upright = np.column_stack([i, j])[i + j < m] + 1.0 / 3.0
-    upside = np.column_stack([i, j])[i + j < m - 1] + 2.0 / 3.0
-    st = np.concatenate([upright, upside]) / m
-    return np.column_stack([1.0 - st.sum(axis=1), st])
-
-
 @njit(cache=True)
-def _before(start, other, x, feet, normal, slack):
-    """Return the pairs of particles that are before the facet of the wall particle, or nearly: no other sees it."""
+def _before(start, other, x, feet, normal, sided, slack):
+    """Return the pairs of particles that are before the facet of the wall particle, or nearly, if it is sided."""
     kept, n = np.zeros_like(start), 0
     for i in range(x.shape[0]):
         for k in range(start[i], start[i + 1]):
             d, height = other[k], 0.0
             for axis in range(x.shape[1]):
                 height += (x[i, axis] - feet[d, axis]) * normal[d, axis]
-            if height > -slack:
+            if height > -slack or not sided[d]:
                 other[n] = d
                 n += 1
         kept[i + 1] = n

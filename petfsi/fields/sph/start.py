@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from petfsi.errors import InputError
-from petfsi.fields.sph.dummies import Domain, Dummies, wall_dummies
-from petfsi.fields.sph.fill import hydrostatic, liquid
+from petfsi.fields.sph.dummies import Domain, Dummies, fine_cells, wall_dummies
+from petfsi.fields.sph.fill import Fill, hydrostatic, liquid
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.solids import nearest, pseudonormals
 from petfsi.scene import fluids
@@ -20,6 +21,9 @@ from petfsi.scene.shape_checks import OPPOSITE
 MACH = 10.0
 #: Parts of the limits on the step: sound, viscosity, forces. The scheme's bounds are 1.2 and, for the second, 0.23.
 ACOUSTIC, VISCOUS, FORCED = 0.9, 0.2, 0.25
+#: A liquid that fills more than this part of the room, of which so many places along each axis are asked, has no free
+#: surface.
+FULL, SAMPLES = 0.9, 24
 #: With less smoothing the kernel's sums are off by more than a hundredth, and pressures with them.
 SMOOTH = {"wendland": 1.4, "quadratic": 1.2, "cubic": 1.1}
 
@@ -59,8 +63,10 @@ class Start:
         gravity = self._gravity()
         c = fluid.sound_speed or self._sound_speed(gravity)
         nu, s = fluid.viscosity / fluid.density, fluid.smoothing * fluid.spacing
-        terms = {"alpha": fluid.alpha, "nu": nu, "delta": fluid.density_diffusion}
-        self.law = Law(scene.dim, fluid.density, c, s, fluid.spacing, fluid.kernel, tuple(gravity.tolist()), **terms)
+        terms: Mapping[str, Any] = {"alpha": fluid.alpha, "nu": nu, "delta": fluid.density_diffusion}
+        suction = self._has_no_surface(found) if fluid.suction is None else fluid.suction
+        g = tuple(gravity.tolist())
+        self.law = Law(scene.dim, fluid.density, c, s, fluid.spacing, fluid.kernel, g, suction=suction, **terms)
         p = np.zeros(len(self.x))
         if fluid.pressure == "hydrostatic":
             p = hydrostatic(self.x, gravity, self.law, self._domain.periodic, found.is_solid)
@@ -92,6 +98,13 @@ class Start:
         if fastest == 0:
             raise InputError("fluid.sound_speed: must be given (m/s), for nothing falls or moves at the start")
         return MACH * fastest
+
+    def _has_no_surface(self, found: Fill) -> bool:
+        """Whether the liquid fills nearly all places that it can be in, as far as a coarse lattice tells."""
+        low, size = self._domain.low, self._domain.high - self._domain.low
+        places = low + size * (fine_cells(self._scene.dim, SAMPLES) + 0.5)
+        room = size.prod() * np.mean(~found.is_solid(places))
+        return bool(found.volume.sum() > FULL * room)
 
     def limits(self) -> dict[str, float]:
         """Return what limits the step at the start by name, s."""

@@ -51,7 +51,7 @@ def _backed(points, facets, reach: float) -> np.ndarray:
     if not len(facets):
         return np.zeros(0, dtype=bool)
     corners = points[facets]
-    sample, facet = _samples(corners, SAMPLED * reach)
+    sample, facet = sampled(corners, SAMPLED * reach)
     low, high = extent(sample)
     wide, counts = fitting(high - low, reach, 1)
     # the distance between samples is longer than that of two planes, by this at most
@@ -60,7 +60,7 @@ def _backed(points, facets, reach: float) -> np.ndarray:
 
 
 @njit(cache=True)
-def _samples(corners, spacing):
+def sampled(corners, spacing):
     """Return points inside of facets (m, dim, dim), about so far apart, and their facets."""
     m, dim = corners.shape[:2]
     parts, n = np.empty(m, np.int64), 0
