@@ -91,6 +91,7 @@ def _sph(scene: Scene) -> FluidPlan:
     hold = "hold back what is drawn away from them" if law.suction else "let go what is drawn away from them"
     why = "" if scene.fluid.suction is not None else ": no" if law.suction else ": a"
     rows.append(("walls", hold + (why and f"{why} free surface at the start")))
+    rows += [("sides", told) for told in [*map(str, start.inlets), *map(str, start.plates)]]
     rows += [("note", note) for note in start.notes]
     return FluidPlan(rows, 0, float((n + n_walls) * PARTICLE_BYTES[dim]), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
 

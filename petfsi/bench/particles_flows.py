@@ -120,7 +120,9 @@ def channel(comm: MPI.Comm, name: str, n: int, spread: float = 0.0, **fluid: Any
     So slow a flow leaves particles on the lattice on which they begin, where sums are exact as nowhere else: ``spread``
     is by how much of their distance they are strewn at random, along each axis.
     """
-    sides = {"left": "periodic", "right": "periodic", "bottom": "no-slip", "top": "no-slip"}
+    sides: dict[str, Any] = {"left": "periodic", "right": "periodic", "bottom": "no-slip", "top": "no-slip"}
+    if name == "couette":
+        sides["top"] = {"no-slip": {"velocity": [SPEED, 0.0]}}
     dx = WIDTH / n
     size = [CHANNEL_LENGTH * dx, WIDTH]
     table = {"spacing": dx, "sound_speed": SOUND, "viscosity": 1000 * NU, "sides": sides, "fill": box(size)}
@@ -128,24 +130,12 @@ def channel(comm: MPI.Comm, name: str, n: int, spread: float = 0.0, **fluid: Any
         table["initial"] = {"velocity": [SPEED, 0.0]}
     gravity = [FORCE if name == "poiseuille" else 0.0, 0.0]
     sim = prepared(comm, END, size, gravity, **table | fluid)
-    if name == "couette":
-        _slide(sim)
     if spread:
         swarm = particles(sim).swarm
         dice = np.random.default_rng(SEED).uniform(-1.0, 1.0, (int(particles(sim).tally()["particles"]), 2))
         swarm["x"] += spread * dx * dice[swarm["id"]]
         particles(sim).forget()
     return sim
-
-
-def _slide(sim: Simulation) -> None:
-    """Have the wall particles above the channel move along it: sides have no velocity in a scene yet."""
-    walls = particles(sim).walls
-    assert walls is not None
-    v = np.zeros_like(walls.rows.v)
-    v[walls.rows.x[:, 1] > WIDTH, 0] = SPEED
-    walls.rows = walls.rows._replace(v=v)
-    particles(sim).forget()  # pairs listed before know the plate at rest
 
 
 def channel_errors(sim: Simulation, exact: Exact) -> tuple[list[float], list[tuple[np.ndarray, np.ndarray]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.fluids import Fluid, InflowSide
+from petfsi.scene.fluids import Fluid, GridInflow, Inflow, InflowSide, MacFluid, MovingSide
 from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.particle_checks import particles
@@ -161,16 +161,27 @@ def _sides(scene: Scene) -> Problems:
                 )
     for side in OPPOSITE[2] if scene.dim == 2 else ():
         if side in sides.model_fields_set:
-            yield Problem(f"fluid.sides.{side}", getattr(sides, side), NO_Z, ("dim",))
+            form = getattr(sides, side)
+            yield Problem(f"fluid.sides.{side}", form if isinstance(form, str) else ABSENT, NO_Z, ("dim",))
     inflows = [(side, table.inflow) for side, table in sides if isinstance(table, InflowSide)]
     for side, inflow in inflows:
         key = f"fluid.sides.{side}.inflow"
         if inflow.region is not None:
             yield from analytic_shape(f"{key}.region", inflow.region, scene.dim)
-        if inflow.smoke > 0 and scene.fluid.smoke is None:
+    yield from _jets(scene, inflows)
+
+
+def _jets(scene: Scene, inflows: list[tuple[str, Inflow]]) -> Problems:
+    """Judge what flows into a grid: particles carry no smoke, and may fill what was empty."""
+    fluid = scene.fluid
+    if not isinstance(fluid, MacFluid):
+        return
+    for side, inflow in inflows:
+        assert isinstance(inflow, GridInflow)
+        if inflow.smoke > 0 and fluid.smoke is None:
             allowed = "smoke needs a table [fluid.smoke] (it may be empty)"
-            yield Problem(f"{key}.smoke", inflow.smoke, allowed, ("fluid.smoke",))
-    leaves = any(form == "open" for _, form in sides) or any(inflow.rest == "open" for _, inflow in inflows)
+            yield Problem(f"fluid.sides.{side}.inflow.smoke", inflow.smoke, allowed, ("fluid.smoke",))
+    leaves = any(form == "open" for _, form in fluid.sides) or any(inflow.rest == "open" for _, inflow in inflows)
     if len(inflows) == 1 and not leaves and not scene.solids:
         allowed = 'what flows in must be able to leave: make a side open, or set rest = "open" here'
         yield Problem(f"fluid.sides.{inflows[0][0]}.inflow", ABSENT, allowed, ("fluid.sides", "solids"))
@@ -288,6 +299,8 @@ def expressions(scene: Scene) -> Iterator[tuple[str, float | str, tuple[str, ...
         for side, form in scene.fluid.sides:
             if isinstance(form, InflowSide):
                 yield f"fluid.sides.{side}.inflow.speed", form.inflow.speed, (*space, "t")
+            elif isinstance(form, MovingSide):
+                yield from each(f"fluid.sides.{side}.no-slip.velocity", form.no_slip.velocity, (*space, "t"))
     for name, solid in scene.solids.items():
         yield from each(f"solids.{name}.initial.velocity", solid.initial.velocity, space)
         yield from each(f"solids.{name}.initial.displacement", solid.initial.displacement, space)

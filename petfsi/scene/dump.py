@@ -12,7 +12,7 @@ from petfsi.scene.schema import Scene
 
 def dump_scene(scene: Scene) -> str:
     """Return the scene with every default filled in; read again, from any folder, it is an equal scene."""
-    data = scene.model_dump(exclude_none=True)
+    data = scene.model_dump(exclude_none=True, by_alias=True)
     if scene.fluid is not None and scene.dim == 2:
         for side in ("back", "front"):
             del data["fluid"]["sides"][side]

@@ -174,6 +174,19 @@ class Expression:
         return f"{self.key or 'expression'} = {text!r}"
 
 
+def evaluate_at(expression: Expression, points: np.ndarray, time: float) -> np.ndarray:
+    """Return an expression's values at points (n, dim); z = 0 in 2D."""
+    columns = dict(zip("xyz", points.T, strict=False))
+    return expression(t=time, **{name: columns.get(name, np.zeros(len(points))) for name in "xyz"})
+
+
+def ramp(time: float, duration: float) -> float:
+    """Return how far a jet has opened: 0 at time zero, 1 from ``duration`` on, smooth between."""
+    if time >= duration:
+        return 1.0
+    return float(np.sin(0.5 * np.pi * max(time, 0.0) / duration) ** 2)
+
+
 def _parse(source: float | str, variables: tuple[str, ...], used: set[str]) -> Term:
     """Return the expression as a function of arrays, and note the variables that it uses."""
     if isinstance(source, bool) or not isinstance(source, int | float | str):

@@ -17,8 +17,20 @@ class Inflow(Table):
     speed: Annotated[Number, Field(description="m/s into the domain; may depend on x, y, z, t")]
     region: Annotated[Shape | None, Field(description="the part of the side in this shape, or all of it")] = None
     ramp: Annotated[Real, Field(ge=0, description="s over which the speed grows smoothly from zero")] = 0.0
+    rest: Annotated[str, Field(description="what the remainder of the side is")] = "slip"
+
+
+class GridInflow(Inflow):
+    """A jet into a grid."""
+
     smoke: Annotated[Real, Field(ge=0, description="smoke carried in")] = 0.0
     rest: Annotated[Literal["slip", "open"], Field(description="what the remainder of the side is")] = "slip"
+
+
+class ParticleInflow(Inflow):
+    """A jet of particles."""
+
+    rest: Annotated[Literal["slip", "no-slip", "open"], Field(description="what the remainder of the side is")] = "slip"
 
 
 class InflowSide(Table):
@@ -27,19 +39,70 @@ class InflowSide(Table):
     inflow: Inflow
 
 
+class GridInflowSide(InflowSide):
+    """That of a side of a grid."""
+
+    inflow: GridInflow
+
+
+class ParticleInflowSide(InflowSide):
+    """That of a side of particles."""
+
+    form: ClassVar[str] = "<inflow>"
+
+    inflow: ParticleInflow
+
+
+class Plate(Table):
+    """What a wall that holds the fluid does."""
+
+    velocity: Annotated[list[Number], Field(description="m/s along the side; may depend on x, y, z, t")]
+
+
+class MovingSide(Table):
+    """A side without slip that moves in its own plane."""
+
+    form: ClassVar[str] = "<no-slip>"
+
+    no_slip: Annotated[Plate, Field(alias="no-slip")]
+
+
 def _side_form(value: Any) -> str:
     """Tell the two forms of a side apart by their type, so that errors speak of one form only."""
     return "<table>" if isinstance(value, dict | InflowSide) else "<name>"
 
 
+def _particle_side_form(value: Any) -> str | None:
+    """Tell the forms of a side of particles apart: by the only key of a table."""
+    if not isinstance(value, dict):
+        return getattr(value, "form", "<name>")
+    forms = {"inflow": ParticleInflowSide.form, "no-slip": MovingSide.form}
+    found = [form for key, form in forms.items() if key in value]
+    return found[0] if len(found) == 1 else None
+
+
+def at_rest(side: str | InflowSide | MovingSide) -> str | InflowSide:
+    """Return what a side of particles would be if it did not move."""
+    return "no-slip" if isinstance(side, MovingSide) else side
+
+
 Side = Annotated[
-    Annotated[Literal["slip", "open", "periodic"], Tag("<name>")] | Annotated[InflowSide, Tag("<table>")],
+    Annotated[Literal["slip", "open", "periodic"], Tag("<name>")] | Annotated[GridInflowSide, Tag("<table>")],
     Discriminator(_side_form),
     Field(description="or { inflow = { speed = ... } }"),
 ]
 
-
-ParticleSide = Literal["slip", "no-slip", "open", "periodic"]
+ParticleSide = Annotated[
+    Annotated[Literal["slip", "no-slip", "open", "periodic"], Tag("<name>")]
+    | Annotated[ParticleInflowSide, Tag(ParticleInflowSide.form)]
+    | Annotated[MovingSide, Tag(MovingSide.form)],
+    Discriminator(
+        _particle_side_form,
+        custom_error_type="side",
+        custom_error_message="must be 'slip', 'no-slip', 'open' or 'periodic', or a table of one key",
+    ),
+    Field(description="or { inflow = { speed = ... } }, or { no-slip = { velocity = [...] } }"),
+]
 
 
 class Sides(Table):

@@ -119,9 +119,10 @@ def _is_form(part: Any) -> bool:
 def _unknown(loc: list[Any]) -> str:
     """Say that there is no such setting, and which one may be meant: beside it, or else in another table."""
     name, table = str(loc[-1]), _model(loc[:-1])
-    fields = table.model_fields if table is not None else {}
+    fields = _settings(table) if table is not None else {}
     others = _walk([part for part in loc[:-1] if not _is_form(part)])[0]
-    having = [kind.form.strip("<>") for kind in others if hasattr(kind, "form") and name in kind.model_fields]
+    kinds = [kind for kind in others if _is_model(kind) and "kind" in _settings(kind)]
+    having = [kind.form.strip("<>") for kind in kinds if name in _settings(kind)]
     if having:
         return f"belongs to kind = {' and '.join(having)}; known here are {', '.join(fields)}"
     near = difflib.get_close_matches(name, fields, 1)
@@ -129,6 +130,8 @@ def _unknown(loc: list[Any]) -> str:
         unit = fields[near[0]].description
         return f"no setting '{name}'; did you mean '{near[0]}'" + (f" ({unit})?" if unit else "?")
     elsewhere = [path for path in _every_setting(Scene) if path[-1] == name]
+    if tuple(part for part in loc if not _is_form(part)) in elsewhere:  # of another form of this table
+        return f"does not belong here; known here are {', '.join(fields)}"
     if elsewhere and len(elsewhere[0]) == 1:
         return f"no setting '{name}' here; it stands at the top of the scene, before any [table]"
     if elsewhere:
@@ -136,8 +139,13 @@ def _unknown(loc: list[Any]) -> str:
     return f"no setting '{name}'; known here are {', '.join(fields)}"
 
 
+def _settings(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Return the fields of a table as a scene spells them."""
+    return {field.alias or name: field for name, field in model.model_fields.items()}
+
+
 def _every_setting(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    for name, field in model.model_fields.items():
+    for name, field in _settings(model).items():
         yield (*path, name)
         for part in _parts(field.annotation):
             named = get_origin(part) is dict
@@ -169,8 +177,8 @@ def _walk(loc: list[Any]) -> tuple[list[Any], FieldInfo | None]:
             here = [kind for kind in here if getattr(kind, "form", part) == part]
             continue
         for kind in here:
-            if _is_model(kind) and part in kind.model_fields:
-                field = kind.model_fields[part]
+            if _is_model(kind) and part in _settings(kind):
+                field = _settings(kind)[part]
                 following += _parts(field.annotation)
             elif get_origin(kind) in (dict, list):
                 following += _parts(get_args(kind)[-1])

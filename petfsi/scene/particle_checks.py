@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from petfsi.scene.fluids import SphFluid
+from petfsi.scene.fluids import MovingSide, SphFluid
 from petfsi.scene.mistakes import Problem
 from petfsi.scene.schema import Scene
-from petfsi.scene.shape_checks import MAX_CELLS, is_measured, periods, plain_shape
+from petfsi.scene.shape_checks import MAX_CELLS, OPPOSITE, is_measured, length, periods, plain_shape
 
 #: Particles see so many smoothing lengths far, and lists of pairs a little farther.
 REACH = 2.1
@@ -24,6 +24,23 @@ def particles(scene: Scene) -> Iterator[Problem]:
         yield from plain_shape(f"fluid.fill.{n}", shape, scene.dim)
     if is_measured(fluid, scene.dim):
         yield from _spacing(fluid, scene.dim)
+    yield from _plates(fluid, scene.dim)
+
+
+def _plates(fluid: SphFluid, dim: int) -> Iterator[Problem]:
+    """Judge the velocities of sides: along them, and of what can hold the fluid."""
+    for axis, pair in enumerate(OPPOSITE[:dim]):
+        for side in pair:
+            form = getattr(fluid.sides, side)
+            if not isinstance(form, MovingSide):
+                continue
+            key, velocity = f"fluid.sides.{side}.no-slip.velocity", form.no_slip.velocity
+            yield from length(key, velocity, dim)
+            if axis < len(velocity) == dim and velocity[axis] != 0:
+                allowed = f"must be 0: a side moves in its own plane only, not along {'xyz'[axis]}"
+                yield Problem(f"{key}.{axis}", velocity[axis], allowed)
+            if fluid.viscosity == 0:
+                yield Problem(key, velocity, "moves no fluid, whose viscosity is 0", ("fluid.viscosity",))
 
 
 def _spacing(fluid: SphFluid, dim: int) -> Iterator[Problem]:

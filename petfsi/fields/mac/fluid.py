@@ -17,13 +17,13 @@ from petfsi.fields.mac.lineage import Lineage
 from petfsi.fields.mac.marks import beside
 from petfsi.fields.mac.parts import Parts
 from petfsi.fields.mac.sheets import Sheets
-from petfsi.fields.mac.sides import evaluate_at, wrapped_points
+from petfsi.fields.mac.sides import wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
 from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.ranks import agreed
 from petfsi.scene import fluids
-from petfsi.scene.expressions import Expression
+from petfsi.scene.expressions import Expression, evaluate_at
 from petfsi.scene.schema import Scene
 from petfsi.scene.tables import Number
 

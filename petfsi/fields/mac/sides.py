@@ -13,8 +13,8 @@ from petfsi.fields.mac import kinds
 from petfsi.fields.mac.grid import MacGrid
 from petfsi.geometry.shapes import bounds, inside
 from petfsi.ranks import agreed, on_root
-from petfsi.scene.expressions import Expression
-from petfsi.scene.fluids import Inflow, InflowSide, Side, Sides
+from petfsi.scene.expressions import Expression, evaluate_at, ramp
+from petfsi.scene.fluids import GridInflow, GridInflowSide, Side, Sides
 from petfsi.scene.schema import Obstacle
 from petfsi.scene.shape_checks import images
 from petfsi.scene.tables import Shape
@@ -48,19 +48,6 @@ def wrapped_points(grid: MacGrid, axis: int | None, index: tuple[np.ndarray, ...
     return points
 
 
-def evaluate_at(expression: Expression, points: np.ndarray, time: float) -> np.ndarray:
-    """Return an expression's values at points (n, dim); z = 0 in 2D."""
-    columns = dict(zip("xyz", points.T, strict=False))
-    return expression(t=time, **{name: columns.get(name, np.zeros(len(points))) for name in "xyz"})
-
-
-def ramp(time: float, duration: float) -> float:
-    """Return how far a jet has opened: 0 at time zero, 1 from ``duration`` on, smooth between."""
-    if time >= duration:
-        return 1.0
-    return float(np.sin(0.5 * np.pi * max(time, 0.0) / duration) ** 2)
-
-
 @dataclass
 class Jet:
     """The local faces, ghosts included, through which an inflow comes.
@@ -74,7 +61,7 @@ class Jet:
         Velocity along the axis at the time last evaluated, m/s.
     """
 
-    spec: Inflow
+    spec: GridInflow
     key: str
     axis: int
     upper: bool
@@ -124,7 +111,7 @@ class Surroundings:
         self.cell_kind[grid.inside(None)] = kinds.FLUID
         self.side_kind = [np.full(grid.shape(axis), kinds.WALL, dtype=np.uint8) for axis in range(grid.dim)]
         self.jets: list[Jet] = []
-        self.has_jets = any(isinstance(getattr(sides, name), InflowSide) for pair in NAMES for name in pair)
+        self.has_jets = any(isinstance(getattr(sides, name), GridInflowSide) for pair in NAMES for name in pair)
         for axis in range(grid.dim):
             for upper, name in enumerate(NAMES[axis]):
                 if not grid.periodic[axis]:
@@ -141,7 +128,7 @@ class Surroundings:
             return
         part = list(grid.inside(axis))
         part[axis] = slice(plane, plane + 1)
-        jet = side.inflow if isinstance(side, InflowSide) else None
+        jet = side.inflow if isinstance(side, GridInflowSide) else None
         if side == "open" or (jet is not None and jet.rest == "open"):
             self.side_kind[axis][tuple(part)] = kinds.OPEN
         if jet is None:

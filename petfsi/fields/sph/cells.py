@@ -224,7 +224,7 @@ def _grown(other, n, needed):
 
 
 @njit(cache=True)
-def _run(first, counts, cell, a, b, dim):
+def line_of_cells(first, counts, cell, a, b, dim):
     """Return the run of rows in the three cells around ``cell`` moved by (a, b) along the axes but the last."""
     last = dim - 1
     low, high = max(cell[last] - 1, 0), min(cell[last] + 2, counts[last])
@@ -294,7 +294,7 @@ def _compile_fluid_pairs(dim):
             # the rest of this line of three cells, then the lines after it
             for run in range(runs):
                 a, b = (run, 0) if dim == 2 else ((run + 1) // 3, (run + 1) % 3 - 1 if run > 1 else run)
-                begin[run], end[run] = _run(first, counts, cell, a, b, dim)
+                begin[run], end[run] = line_of_cells(first, counts, cell, a, b, dim)
             begin[0] = first[c]
             most = np.sum(end - begin)
             if hit.size < most:
@@ -330,7 +330,7 @@ def _compile_wall_pairs(dim):
             _locate(cell, counts, c, dim)
             for run in range(runs):
                 a, b = (run - 1, 0) if dim == 2 else (run // 3 - 1, run % 3 - 1)
-                begin[run], end[run] = _run(first_wall, counts, cell, a, b, dim)
+                begin[run], end[run] = line_of_cells(first_wall, counts, cell, a, b, dim)
             most = np.sum(end - begin)
             if hit.size < most:
                 hit = np.empty(2 * most, dtype=np.uint8)

@@ -153,7 +153,8 @@ def wall_dummies(
     solids = build_solids(domain, dx, obstacles, directory, layers * dx)
     dim, deep = len(domain.low), layers * dx
     names = (*SIDES[: 2 * dim], *obstacles)
-    rough = np.array([kind == "no-slip" for pair in domain.sides for kind in pair] + [o in no_slip for o in obstacles])
+    walls = [kind.inflow.rest if isinstance(kind, InflowSide) else kind for pair in domain.sides for kind in pair]
+    rough = np.array([kind == "no-slip" for kind in walls] + [o in no_slip for o in obstacles])
     x, volume, normal, depth, wall = _outside_box(domain, dx, layers)
     foot = x + depth[:, None] * normal
     hidden = np.zeros(len(x), dtype=bool)

@@ -22,6 +22,7 @@ from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.fields.sph import moves, probes
 from petfsi.fields.sph.balance import bisect
 from petfsi.fields.sph.cells import PairLists, Pairs
+from petfsi.fields.sph.openings import Openings
 from petfsi.fields.sph.particles import StrayError, Swarm
 from petfsi.fields.sph.passes import FluidRows, Passes
 from petfsi.fields.sph.room import Room
@@ -68,6 +69,8 @@ class SphFluid(FluidField):
         Of particles, as last listed.
     room : Room
         The box, its sides, and the grid of cells.
+    openings : Openings
+        What comes and goes through the sides.
     """
 
     name = "particles"
@@ -92,12 +95,13 @@ class SphFluid(FluidField):
         boxes = bisect(comm, self.room.grid, self.room.grid.of(rows["x"]))
         self.swarm.insert(rows)
         self.swarm.rebuild(boxes)
+        self.openings = Openings(comm, self.room, self.law, start.inlets, len(start.x), start.waiting)
         dummies = start.dummies()
-        self.walls = Walls(comm, self.room.grid, boxes, dummies) if len(dummies.x) else None
+        self.walls = Walls(comm, self.room.grid, boxes, dummies, start.plates) if len(dummies.x) else None
         self.skin: Skin | None = None
         self.sight: Sight | None = None
         self.n_put_back = 0
-        self.kept: dict[str, np.ndarray] = {}
+        self.kept: dict[str, np.ndarray] = dict(self.openings.kept)
         self.tallied: dict[str, float] = {}
         self._notes, self._taken = start.notes, dummies.x
         self.swarm["a"][:] = self.gravity(0.0)
@@ -160,12 +164,14 @@ class SphFluid(FluidField):
             swarm["origin"], self._begin = swarm["x"], self.skin.points
         moves.kick(swarm["v"], swarm["a"], half)
         moves.drift(swarm["x"], swarm["v"], half)
+        self.openings.drift(half)
         if self.skin is not None:
             self.skin.place(self.skin.points + half * self.skin.velocity, self.skin.velocity)
         self._refresh("x", "v", "rho")
         swarm = self.swarm
         self._condense(time + half, dt)
         moves.drift(swarm["x"], swarm["v"], half)
+        self.openings.drift(half)
         mine = swarm.owned
         self._way += dt * (swarm["m"][mine] @ swarm["v"][mine])
         if self.room.shifting:
@@ -185,6 +191,7 @@ class SphFluid(FluidField):
         rho = swarm["rho"][mine]
         power = swarm["m"][mine] * self.law.pressure(rho) / rho**2 @ rates.diffusive[mine]
         self._diffused -= dt * float(power)
+        self.openings.hold(swarm, rates.total, dt)
         swarm["rho"] += dt * rates.total
 
     def assemble(self, time: float, dt: float) -> None:
@@ -204,6 +211,7 @@ class SphFluid(FluidField):
         p = self.law.pressure(fluid.rho)
         if self.skin is not None:
             self.skin.look(fluid.x)
+        self.openings.press(self.swarm, p, self.law)
         for walls in sets:
             walls.press(self.passes, fluid, p)
         forces = self.passes.forces(fluid, p, self.pairs, *(walls.met for walls in sets))
@@ -213,7 +221,9 @@ class SphFluid(FluidField):
         self._dissipated = dt * float(forces.dissipated[mine].sum())
         self.swarm["S"] = moves.fade(forces.S, forces.full)
         self.swarm["a"] = forces.f / fluid.m[:, None] + self.gravity(end)
-        self.room.let_go(self.swarm, self.gravity(end), dt)
+        self.openings.lead(self.swarm, self.gravity(end), end, dt)
+        if not self._moving:
+            self.openings.take_lost()  # nothing is done outside of steps
         self._pushed = True
 
     def _guard(self, dt: float) -> None:
@@ -254,7 +264,9 @@ class SphFluid(FluidField):
         return FluidRows(swarm["x"], swarm["v"], swarm["rho"], swarm["m"])
 
     def _weigh(self, time: float) -> None:
-        """Let pressures balance the gravity of this time."""
+        """Let pressures balance the gravity of this time, and sides move as they do then."""
+        if self.walls is not None:
+            self.walls.slide(time)
         g = tuple(self.gravity(time).tolist())
         if g != self.law.gravity:
             self.law = self.passes.law = replace(self.law, gravity=g)
@@ -279,7 +291,7 @@ class SphFluid(FluidField):
     def _list_pairs(self) -> None:
         """Sort the particles and list their pairs. Collective."""
         swarm, reach = self.swarm, (1 + SKIN) * self.room.reach
-        self.room.release(swarm)
+        self.openings.exchange(swarm)
         self.room.check(self.comm, swarm)
         try:
             swarm.rebuild(swarm.balanced())
@@ -344,7 +356,10 @@ class SphFluid(FluidField):
         ``damping`` holds what viscosity and diffusion took, and shifting, as far as it moved weight down.
         """
         gravity = float(self._way @ np.array(self.law.gravity))
-        return Work(gravity=gravity, damping=self._dissipated + self._diffused, boundary=-self.room.take_lost())
+        boundary = -self.openings.take_lost()
+        if self.walls is not None:
+            boundary += dt * self.walls.power()
+        return Work(gravity=gravity, damping=self._dissipated + self._diffused, boundary=boundary)
 
     # ---- what others see ------------------------------------------------------------------------------------------
 
@@ -354,9 +369,10 @@ class SphFluid(FluidField):
         return self._notes
 
     def tally(self) -> dict[str, float]:
-        """Return the number of particles, and how many were put back where thin bodies are. Collective."""
+        """Return the number of particles, what went through sides, and how many thin bodies threw back. Collective."""
         put_back = {} if self.sight is None else {"put_back": float(self.n_put_back)}
-        return {"particles": float(self.comm.allreduce(self.swarm.n_owned))} | put_back | self.tallied
+        through = self.openings.tally(self.swarm)
+        return {"particles": float(self.comm.allreduce(self.swarm.n_owned))} | through | put_back | self.tallied
 
     def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:
         """Return ``pressure`` or ``velocity`` at a point, ``level`` there, or ``front`` of all. Collective."""

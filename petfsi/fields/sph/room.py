@@ -1,8 +1,9 @@
-"""The box that holds the particles, its sides, and what becomes of those that leave it."""
+"""The box that holds the particles and its sides."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -11,7 +12,9 @@ from petfsi.errors import SolveError
 from petfsi.fields.sph.cells import CellGrid, cell_grid
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.particles import Swarm
+from petfsi.geometry.shapes import inside
 from petfsi.scene import fluids
+from petfsi.scene.fluids import InflowSide
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import OPPOSITE
 
@@ -27,7 +30,7 @@ class Room:
     ----------
     low, high : ndarray, shape (dim,)
         Its corners, m.
-    sides : list of (str, str)
+    sides : list of pairs of str or InflowSide
         What it has along each axis.
     grid : CellGrid
     reach : float
@@ -39,14 +42,11 @@ class Room:
 
     low: np.ndarray
     high: np.ndarray
-    sides: list[tuple[str, str]]
+    sides: list[tuple[str | InflowSide, str | InflowSide]]
     grid: CellGrid
     reach: float
     spacing: float
-    law: Law
     shifting: bool
-    _lost: float = field(default=0.0)
-    n_lost: int = 0
 
     @classmethod
     def of(cls, scene: Scene, law: Law, skin: float) -> Room:
@@ -55,53 +55,47 @@ class Room:
         assert isinstance(fluid, fluids.SphFluid)
         low = np.array(fluid.origin, dtype=float)
         high = low + fluid.size
-        sides = [(getattr(fluid.sides, a), getattr(fluid.sides, b)) for a, b in OPPOSITE[: scene.dim]]
+        forms = [[fluids.at_rest(getattr(fluid.sides, side)) for side in pair] for pair in OPPOSITE[: scene.dim]]
+        sides = [(lower, upper) for lower, upper in forms]
         periodic = np.array([pair == ("periodic", "periodic") for pair in sides])
         reach = 2.0 * law.s
         margin = np.where(periodic, 0.0, MARGIN * reach)
         grid = cell_grid(low - margin, high + margin, (1 + skin) * reach, periodic)
-        return cls(low, high, sides, grid, reach, fluid.spacing, law, fluid.shifting)
-
-    def _beyond(self, x: np.ndarray, kind: str, by: float) -> np.ndarray:
-        """Return which places are farther than ``by`` beyond a side of a kind ("open", or any wall)."""
-        out = np.zeros(len(x), dtype=bool)
-        for axis, pair in enumerate(self.sides):
-            for side, outward, plane in zip(pair, (-1.0, 1.0), (self.low[axis], self.high[axis]), strict=True):
-                if (side == "open") == (kind == "open") and side != "periodic":
-                    out |= outward * (x[:, axis] - plane) > by
-        return out
+        return cls(low, high, sides, grid, reach, fluid.spacing, fluid.shifting)
 
     @property
     def is_open(self) -> bool:
-        """Whether a side is open."""
-        return any("open" in pair for pair in self.sides)
+        """Whether something may leave through a side."""
+        return any("open" in (side, _rest(side)) for pair in self.sides for side in pair)
 
-    def let_go(self, swarm: Swarm, gravity: np.ndarray, dt: float) -> None:
-        """Let those beyond open sides fall freely, without pressure; what others do to them leaves through the side."""
-        if self.is_open:
-            gone = np.flatnonzero(self._beyond(swarm["x"], "open", 0.0))
-            mine = gone[swarm.owned[gone]]
-            m = swarm["m"][mine]
-            power = np.sum((swarm["a"][mine] - gravity) * swarm["v"][mine], axis=1)
-            self._lost += float(m @ (self.law.elastic_energy(swarm["rho"][mine]) + dt * power))
-            swarm["a"][gone] = gravity
-            swarm["rho"][gone] = self.law.rho0
+    def beyond_open(self, x: np.ndarray, by: float = 0.0) -> np.ndarray:
+        """Return which places x (n, dim) are farther than ``by`` (m) beyond an open side."""
+        return self._beyond(x, ("open",), by)
 
-    def release(self, swarm: Swarm) -> None:
-        """Take out those that are no longer seen from inside: a reach beyond an open side."""
-        if self.is_open:
-            gone = self._beyond(swarm["x"], "open", self.reach) & swarm.owned
-            if np.any(gone):
-                m, v = swarm["m"][gone], swarm["v"][gone]
-                energy = 0.5 * np.sum(v**2, axis=1) + self.law.elastic_energy(swarm["rho"][gone])
-                self._lost += float(m @ energy)
-                self.n_lost += int(np.count_nonzero(gone))
-                swarm.remove(gone)
+    def beyond_inflow(self, x: np.ndarray, by: float = 0.0) -> np.ndarray:
+        """Return which places x (n, dim) are farther than ``by`` (m) beyond an inflow, and beyond no open side."""
+        out = self._beyond(x, ("inflow",), by)
+        return out & ~self.beyond_open(x) if self.is_open and out.any() else out
 
-    def take_lost(self) -> float:
-        """Return the energy of those that went since the last call, J, this rank's share."""
-        lost, self._lost = self._lost, 0.0
-        return lost
+    def _beyond(self, x: np.ndarray, kinds: tuple[str, ...], by: float) -> np.ndarray:
+        out = np.zeros(len(x), dtype=bool)
+        for axis, outward, plane, side in self._planes():
+            if not isinstance(side, InflowSide):
+                if side in kinds:
+                    out |= outward * (x[:, axis] - plane) > by
+                continue
+            past = np.flatnonzero(outward * (x[:, axis] - plane) > by)
+            let_in = np.ones(len(past), dtype=bool)
+            if side.inflow.region is not None:
+                let_in = inside(side.inflow.region, np.clip(x[past], self.low, self.high))
+            out[past] |= np.where(let_in, "inflow" in kinds, side.inflow.rest in kinds)
+        return out
+
+    def _planes(self) -> Iterator[tuple[int, float, float, str | InflowSide]]:
+        """Yield the axis, the sense of the way out, the coordinate and the form of each side."""
+        for axis, pair in enumerate(self.sides):
+            yield axis, -1.0, self.low[axis], pair[0]
+            yield axis, 1.0, self.high[axis], pair[1]
 
     def check(self, comm: MPI.Comm, swarm: Swarm) -> None:
         """Raise if a particle is a spacing or more behind a wall of the box. Collective.
@@ -114,7 +108,7 @@ class Room:
         x = swarm["x"]
         with np.errstate(invalid="ignore"):
             # what has left through an open side may be anywhere
-            out = self._beyond(x, "wall", self.spacing) & ~self._beyond(x, "open", 0.0) & swarm.owned
+            out = self._beyond(x, ("slip", "no-slip"), self.spacing) & ~self.beyond_open(x) & swarm.owned
         worst = int(swarm["id"][out].min(initial=np.iinfo(np.int64).max))
         first = comm.allreduce(worst, MPI.MIN)
         if first == np.iinfo(np.int64).max:
@@ -125,3 +119,7 @@ class Room:
             f"particle {first} has gone through a wall: it is at ({at}), a spacing or more outside of the box; a "
             f"shorter time.dt, a larger fluid.sound_speed or a smaller fluid.spacing may help"
         )
+
+
+def _rest(side: str | InflowSide) -> str | None:
+    return side.inflow.rest if isinstance(side, InflowSide) else None

@@ -10,8 +10,10 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.fields.sph.dummies import Domain, Dummies, fine_cells, wall_dummies
 from petfsi.fields.sph.fill import Fill, hydrostatic, liquid
+from petfsi.fields.sph.inlets import inlets
 from petfsi.fields.sph.law import Law
-from petfsi.fields.sph.solids import nearest, pseudonormals
+from petfsi.fields.sph.plates import plates
+from petfsi.fields.sph.solids import SAME, nearest, pseudonormals
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Obstacle, Scene
@@ -34,10 +36,14 @@ class Start:
     Attributes
     ----------
     law : Law
+    inlets : list of Inlet
+    plates : list of Plate
     x, v : ndarray, shape (n, dim)
-        m, m/s.
+        m, m/s; those that wait behind inflows last.
     rho, m : ndarray, shape (n,)
         kg/m^3 and kg (per metre in 2D): the mass of a place is that of what fills it under its pressure.
+    waiting : float
+        Mass of those that wait, kg.
     notes : list of str
         What a user should know.
 
@@ -52,7 +58,10 @@ class Start:
         assert isinstance(fluid, fluids.SphFluid)
         self._scene, self._fluid = scene, fluid
         low = np.array(fluid.origin, dtype=float)
-        sides = tuple((getattr(fluid.sides, a), getattr(fluid.sides, b)) for a, b in OPPOSITE[: scene.dim])
+        sides = tuple(
+            (fluids.at_rest(getattr(fluid.sides, a)), fluids.at_rest(getattr(fluid.sides, b)))
+            for a, b in OPPOSITE[: scene.dim]
+        )
         self._domain = Domain(low, low + fluid.size, sides)
         solid = scene.obstacles | _bodies(scene)
         found = liquid(self._domain, fluid.spacing, fluid.fill, solid, scene.directory, fitted=True)
@@ -61,8 +70,10 @@ class Start:
             raise InputError("fluid.fill: holds no particle; is it outside the box, or inside an obstacle?")
         self.v = self._velocities()
         gravity = self._gravity()
-        c = fluid.sound_speed or self._sound_speed(gravity)
         nu, s = fluid.viscosity / fluid.density, fluid.smoothing * fluid.spacing
+        self.plates = plates(self._domain, fluid, scene.time.end)
+        self.inlets = inlets(self._domain, fluid.spacing, 2 * s, found.is_solid, scene.time.end)
+        c = fluid.sound_speed or self._sound_speed(gravity)
         terms: Mapping[str, Any] = {"alpha": fluid.alpha, "nu": nu, "delta": fluid.density_diffusion}
         suction = self._has_no_surface(found) if fluid.suction is None else fluid.suction
         g = tuple(gravity.tolist())
@@ -72,11 +83,35 @@ class Start:
             p = hydrostatic(self.x, gravity, self.law, self._domain.periodic, found.is_solid)
         self.rho = self.law.density(p)
         self.m = self.rho * found.volume
+        self._let_wait(p)
+        if c < MACH * self._driven * (1 - SAME):
+            self.notes.append(
+                f"fluid.sound_speed = {c:g}: less than {MACH:g} times what comes in or moves at a side, "
+                f"{self._driven:.3g} m/s, so that densities vary by more than a hundredth"
+            )
         if fluid.smoothing < SMOOTH[fluid.kernel]:
             self.notes.append(
                 f"fluid.smoothing = {fluid.smoothing:g}: the {fluid.kernel} kernel's sums err by more than 1% on a "
                 f"lattice below {SMOOTH[fluid.kernel]:g}, and pressures by as much"
             )
+
+    def _let_wait(self, p: np.ndarray) -> None:
+        """Add the particles that wait behind inflows, under the pressure p (n,) of the liquid inside."""
+        parts = [(self.x, self.v, self.rho, self.m)]
+        for inlet in self.inlets:
+            x, column = inlet.filled()
+            at_foot = inlet.pressure_in(self.x, p, self.law, 2 * self.law.s)[column]
+            way = x - inlet.feet[column]
+            rho = self.law.density(at_foot + self.law.rho0 * (way @ np.array(self.law.gravity)))
+            v = inlet.speed(0.0)[column][:, None] * inlet.inward
+            parts.append((x, v, rho, rho * float(np.prod(inlet.width))))
+        self.waiting = sum(float(part[3].sum()) for part in parts[1:])
+        self.x, self.v, self.rho, self.m = (np.concatenate(every) for every in zip(*parts, strict=True))
+
+    @property
+    def _driven(self) -> float:
+        """The largest speed of what comes in and of sides, m/s."""
+        return max([0.0, *(inlet.fastest for inlet in self.inlets), *(plate.fastest for plate in self.plates)])
 
     def _gravity(self) -> np.ndarray:
         given = self._scene.gravity or [0.0] * self._scene.dim
@@ -92,9 +127,9 @@ class Start:
         return v
 
     def _sound_speed(self, gravity: np.ndarray) -> float:
-        """Return 10 times the speed of what falls through the liquid's height, or that it has at the start, m/s."""
+        """Return 10 times the speed of what falls through the liquid's height, of inflows and so on, m/s."""
         heights = self.x @ gravity
-        fastest = max(float(np.sqrt(2 * np.ptp(heights))), float(np.linalg.norm(self.v, axis=1).max()))
+        fastest = max(float(np.sqrt(2 * np.ptp(heights))), float(np.linalg.norm(self.v, axis=1).max()), self._driven)
         if fastest == 0:
             raise InputError("fluid.sound_speed: must be given (m/s), for nothing falls or moves at the start")
         return MACH * fastest

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 
@@ -10,10 +12,11 @@ from petfsi.fields.sph.cells import CellGrid, PairLists
 from petfsi.fields.sph.dummies import Dummies
 from petfsi.fields.sph.particles import Swarm
 from petfsi.fields.sph.passes import FluidRows, Met, Passes, WallRows
+from petfsi.fields.sph.plates import Plate
 
 
 class Walls:
-    """Wall particles of sides and obstacles, at rest, on the ranks of a fluid's particles.
+    """Wall particles of sides and obstacles, in their places for ever, on the ranks of a fluid's particles.
 
     Parameters
     ----------
@@ -24,6 +27,8 @@ class Walls:
         The fluid's at present.
     dummies : Dummies
         The same on every rank.
+    plates : sequence of Plate
+        Sides that move in their own plane: their particles have its velocity and stay where they are.
 
     Attributes
     ----------
@@ -33,7 +38,9 @@ class Walls:
         Of the last force pass, N; complete on owned rows.
     """
 
-    def __init__(self, comm: MPI.Comm, grid: CellGrid, boxes: Boxes, dummies: Dummies):
+    def __init__(
+        self, comm: MPI.Comm, grid: CellGrid, boxes: Boxes, dummies: Dummies, plates: Sequence[Plate] = ()
+    ) -> None:
         dim = dummies.x.shape[1]
         columns: dict[str, tuple[int | tuple[()], type]] = {
             "volume": ((), np.float64),
@@ -50,14 +57,33 @@ class Walls:
         rows = {name: getattr(dummies, name)[mine] for name in ("x", "volume", "normal", "depth", "no_slip", "wall")}
         self._swarm.insert(rows | {"id": np.arange(len(dummies.x))[mine]})
         self._lists = PairLists()
+        sides = dummies.wall < 2 * dim
+        of = [np.flatnonzero(sides & plate.holds(dummies.x)) for plate in plates]
+        self._plates = [(plate, some, plate.feet(dummies.x[some])) for plate, some in zip(plates, of, strict=True)]
+        self._velocity, self._time = np.zeros_like(dummies.x), np.nan
         self._make_rows()
 
     def _make_rows(self) -> None:
         self._swarm.rebuild()
         rows = {name: self._swarm[name] for name in ("x", "volume", "normal", "depth")}
-        still = np.zeros_like(rows["x"])
-        self.rows = WallRows(v=still, a=still, no_slip=self._swarm["no_slip"].astype(bool), **rows)
+        v, still = self._velocity[self._swarm["id"]], np.zeros_like(rows["x"])
+        self.rows = WallRows(v=v, a=still, no_slip=self._swarm["no_slip"].astype(bool), **rows)
         self.force = np.zeros_like(still)
+
+    def slide(self, time: float) -> None:
+        """Let sides move as they do at this time. Not collective: every rank finds the same."""
+        known = not np.isnan(self._time)
+        for plate, some, feet in self._plates:
+            if not (known and plate.is_steady):
+                self._velocity[some] = plate.velocity(feet, time)
+        if self._plates and time != self._time:
+            self._time = time
+            self.rows.v[...] = self._velocity[self._swarm["id"]]
+
+    def power(self) -> float:
+        """Return what sides that move do to the fluid, this rank's share, W."""
+        owned = self._swarm.owned
+        return -float(np.sum(self.force[owned] * self.rows.v[owned])) if self._plates else 0.0
 
     def farthest(self) -> float:
         """Return how far they have gone since pairs were listed: nowhere."""
