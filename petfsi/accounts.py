@@ -40,7 +40,8 @@ class Accounts:
     ``boundary_work``
         What came in so far: the supports' reactions, the residual of their equations, times w dt; through inflows
         and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow; and
-        with what closes the volume of regions, pressure times that. Minus the energy of particles that left.
+        with what closes the volume of regions, pressure times that. Of particles the work of sides that move, and the
+        energy of all that came and left, with what is done on them beyond sides.
     ``energy_residual``
         kinetic + elastic + potential + dissipated - load_work - boundary_work, less its initial value: what the
         scheme's own damping took (negative) or gave, with advection, cuts that change and what linearising a step

@@ -109,6 +109,17 @@ def test_what_comes_in_over_a_part_of_a_side_fills_a_tank():
     assert abs(values["energy_residual"]) < 0.02 * values["boundary_work"]
 
 
+def test_what_falls_beyond_an_open_side_is_taken_out_below_the_box_too():
+    made = channel(
+        {"left": "slip"}, 0.6, 0.2, initial={"velocity": [0.3, 0.0]}, gravity=[0.0, -9.81], sound_speed=20.0, end=0.6
+    )
+    sim = prepared(made)
+    start = sim.fluid.tally()
+    run(sim)
+    assert sim.fluid.tally()["mass"] < 0.85 * start["mass"]
+    assert abs(balance(sim, start)) < 1e-9
+
+
 @pytest.mark.parallel([1, 2])
 def test_a_plate_that_moves_draws_the_fluid_along():
     """Couette flow, and in a closed cavity a lid, whose work is what viscosity takes and the flow has.

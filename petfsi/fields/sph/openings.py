@@ -7,8 +7,8 @@ has the pressure that the fluid inside has at the column's foot,
 
 so it passes the side with the pressure it will have there. At the far end of a column a particle of the mass
 rho(p) times its volume comes where the next one of its lattice would, with the next id. Beyond an open side particles
-fall freely, without pressure; a reach beyond they are taken out. What is changed by hand is work done by what lies
-beyond, and is kept account of.
+fall freely, without pressure; once out of sight from inside they are taken out. What is changed by hand is work done by
+what lies beyond, and is kept account of.
 
 Particles come and go only when pairs are listed anew. All ranks know all columns, so nothing depends on the ranks.
 """
@@ -159,7 +159,7 @@ class Openings:
         """
         if not self.kept:
             return
-        gone = swarm.owned & self.room.beyond_open(swarm["x"], self.room.reach)
+        gone = swarm.owned & self.room.is_out_of_sight(swarm["x"]) & self.room.beyond_open(swarm["x"])
         back = np.zeros(len(swarm), dtype=bool)
         for inlet in self.inlets:
             deep = inlet.holds(swarm["x"] + inlet.depth * inlet.inward)

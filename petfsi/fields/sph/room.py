@@ -68,14 +68,19 @@ class Room:
         """Whether something may leave through a side."""
         return any("open" in (side, _rest(side)) for pair in self.sides for side in pair)
 
-    def beyond_open(self, x: np.ndarray, by: float = 0.0) -> np.ndarray:
-        """Return which places x (n, dim) are farther than ``by`` (m) beyond an open side."""
-        return self._beyond(x, ("open",), by)
+    def beyond_open(self, x: np.ndarray) -> np.ndarray:
+        """Return which places x (n, dim) are beyond an open side."""
+        return self._beyond(x, ("open",), 0.0)
 
-    def beyond_inflow(self, x: np.ndarray, by: float = 0.0) -> np.ndarray:
-        """Return which places x (n, dim) are farther than ``by`` (m) beyond an inflow, and beyond no open side."""
-        out = self._beyond(x, ("inflow",), by)
+    def beyond_inflow(self, x: np.ndarray) -> np.ndarray:
+        """Return which places x (n, dim) are beyond an inflow, and beyond no open side."""
+        out = self._beyond(x, ("inflow",), 0.0)
         return out & ~self.beyond_open(x) if self.is_open and out.any() else out
+
+    def is_out_of_sight(self, x: np.ndarray) -> np.ndarray:
+        """Return which places x (n, dim) cannot be seen from inside the box."""
+        way = np.where(self.grid.periodic, 0.0, x - np.clip(x, self.low, self.high))
+        return np.sum(way**2, axis=1) > self.reach**2
 
     def _beyond(self, x: np.ndarray, kinds: tuple[str, ...], by: float) -> np.ndarray:
         out = np.zeros(len(x), dtype=bool)
