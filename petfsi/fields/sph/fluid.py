@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
+from scipy.spatial import cKDTree
 
 from petfsi.errors import SolveError
 from petfsi.fields.base import FluidField, Reader, Slab, Stock, Work
@@ -29,7 +30,7 @@ from petfsi.fields.sph.room import Room
 from petfsi.fields.sph.sight import Sight
 from petfsi.fields.sph.skin import Skin
 from petfsi.fields.sph.start import Start, depth_behind, limits
-from petfsi.fields.sph.thin import thin_facets, wet_on_both_sides
+from petfsi.fields.sph.thin import thin_shells, wet_on_both_sides
 from petfsi.fields.sph.walls import Walls
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
@@ -41,6 +42,11 @@ SKIN = 0.05
 GAP, FEW, MOST = 0.1, 10, 1000
 #: Particles begin so far, in spacings, before solids.
 CLEARANCE = 0.25
+#: Bodies thinner than so many spacings for the most part hide one side from the other, and have two sets of wall
+#: particles; if so large a part of the others' surface is as thin, that is told.
+THIN, PARTLY = 1.75, 0.02
+#: A point nearer than so many spacings to a wall particle that is a spacing or more inside is there, too.
+SUNK = 0.6
 #: Speeds above this part of that of sound, and densities off by more than this part, are remarked on.
 FAST, DENSE = 0.2, 0.05
 #: What a checkpoint holds besides "id" and "x".
@@ -104,6 +110,7 @@ class SphFluid(FluidField):
         self.kept: dict[str, np.ndarray] = dict(self.openings.kept)
         self.tallied: dict[str, float] = {}
         self._notes, self._taken = start.notes, dummies.x
+        self._deep = cKDTree(dummies.x[dummies.depth > self.spacing])
         self.swarm["a"][:] = self.gravity(0.0)
         self._warned = False
         self._forget_step()
@@ -121,12 +128,18 @@ class SphFluid(FluidField):
         """
         self.clear(points, facets)
         reach = (1 + SKIN) * self.room.reach
-        thin = thin_facets(points, facets, reach)
+        thin, part = thin_shells(points, facets, THIN * self.spacing)
+        if part > PARTLY:
+            self._notes.append(
+                f"{100 * part:.2g}% of the solids' surface is of parts thinner than {THIN * self.spacing:g} m: water "
+                "on both sides of these feels that on the other; a smaller fluid.spacing may help"
+            )
         about = thin, self.law.nu > 0, self._taken
         self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, *about)
         if np.any(thin):
             both = wet_on_both_sides(points, facets, reach)
             self.sight = Sight(facets, thin, reach, both, self.room.grid)
+        self._rooted = self._sunk()
         self._listed = False
         return self.skin
 
@@ -297,6 +310,8 @@ class SphFluid(FluidField):
             swarm.rebuild(swarm.balanced())
         except StrayError as error:
             raise SolveError(f"the particles have blown up: {error}") from None
+        if self.skin is not None:
+            self._refuse_sunk()
         swarm["anchor"][:] = swarm["x"]
         self.pairs: Pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
         if self.sight is not None and self.skin is not None:
@@ -305,6 +320,28 @@ class SphFluid(FluidField):
         for walls in self._sets():
             walls.meet(swarm, reach)
         self._listed = True
+
+    def _sunk(self) -> np.ndarray:
+        """Return which points of the surface are a spacing or more inside of walls, or beyond."""
+        assert self.skin is not None
+        x, room = self.skin.points, self.room
+        return room.behind_wall(x, self.spacing) | (self._deep.query(x)[0] < SUNK * self.spacing)
+
+    def _refuse_sunk(self) -> None:
+        """See that no solid has gone into a wall. Not collective; all ranks know the same.
+
+        Raises
+        ------
+        SolveError
+        """
+        assert self.skin is not None
+        sunk = np.flatnonzero(self._sunk() & ~self._rooted)
+        if len(sunk):
+            at = ", ".join(f"{c:g}" for c in self.skin.points[sunk[0]])
+            raise SolveError(
+                f"a solid has gone into a wall: a point of it is at ({at}), a spacing or more behind a side's or an "
+                "obstacle's face; solids do not feel walls"
+            )
 
     # ---- how long a step may be -----------------------------------------------------------------------------------
 

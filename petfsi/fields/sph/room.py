@@ -102,6 +102,11 @@ class Room:
             yield axis, -1.0, self.low[axis], pair[0]
             yield axis, 1.0, self.high[axis], pair[1]
 
+    def behind_wall(self, x: np.ndarray, by: float) -> np.ndarray:
+        """Return which places x (n, dim) are farther than ``by`` (m) behind a wall of the box."""
+        # what has left through an open side may be anywhere
+        return self._beyond(x, ("slip", "no-slip"), by) & ~self.beyond_open(x)
+
     def check(self, comm: MPI.Comm, swarm: Swarm) -> None:
         """Raise if a particle is a spacing or more behind a wall of the box. Collective.
 
@@ -112,8 +117,7 @@ class Room:
         """
         x = swarm["x"]
         with np.errstate(invalid="ignore"):
-            # what has left through an open side may be anywhere
-            out = self._beyond(x, ("slip", "no-slip"), self.spacing) & ~self.beyond_open(x) & swarm.owned
+            out = self.behind_wall(x, self.spacing) & swarm.owned
         worst = int(swarm["id"][out].min(initial=np.iinfo(np.int64).max))
         first = comm.allreduce(worst, MPI.MIN)
         if first == np.iinfo(np.int64).max:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from petfsi.fields.sph.fill import Fill, hydrostatic, liquid
 from petfsi.fields.sph.inlets import inlets
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.plates import plates
-from petfsi.fields.sph.solids import SAME, nearest, pseudonormals
+from petfsi.fields.sph.solids import SAME, Solid, nearest, pseudonormals
+from petfsi.fields.sph.thin import backed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Obstacle, Scene
@@ -26,6 +27,8 @@ ACOUSTIC, VISCOUS, FORCED = 0.9, 0.2, 0.25
 #: A liquid that fills more than this part of the room, of which so many places along each axis are asked, has no free
 #: surface.
 FULL, SAMPLES = 0.9, 24
+#: What bodies are called among the obstacles that keep liquid out at the start.
+BODY = "solids."
 #: With less smoothing the kernel's sums are off by more than a hundredth, and pressures with them.
 SMOOTH = {"wendland": 1.4, "quadratic": 1.2, "cubic": 1.1}
 
@@ -89,6 +92,7 @@ class Start:
                 f"fluid.sound_speed = {c:g}: less than {MACH:g} times what comes in or moves at a side, "
                 f"{self._driven:.3g} m/s, so that densities vary by more than a hundredth"
             )
+        self.notes += _thin_obstacles(found.solids, 2 * s)
         if fluid.smoothing < SMOOTH[fluid.kernel]:
             self.notes.append(
                 f"fluid.smoothing = {fluid.smoothing:g}: the {fluid.kernel} kernel's sums err by more than 1% on a "
@@ -158,15 +162,34 @@ class Start:
         return {**found, "id": np.arange(len(self.x))[mine]}
 
 
+def _thin_obstacles(solids: Sequence[Solid], reach: float) -> list[str]:
+    """Return that water on two sides of an obstacle feels what is on the other, where it does."""
+    found = []
+    for solid in solids:
+        corners = solid.corners
+        points = corners.reshape(-1, corners.shape[2])
+        facets = np.arange(len(points)).reshape(corners.shape[:2])
+        if not solid.name.startswith(BODY) and np.any(backed(points, facets, reach)):
+            found.append(
+                f"obstacles.{solid.name}: is thinner than particles see, {reach:g} m, so those on its two sides feel "
+                'each other; a solid that is held everywhere (supports where = "all") parts them, however thin it is'
+            )
+    return found
+
+
 def _bodies(scene: Scene) -> dict[str, Obstacle]:
-    """Return what solids fill at the start, as obstacles; beams are too thin, and displaced ones are elsewhere."""
+    """Return what solids fill at the start, as obstacles.
+
+    Beams are too thin, displaced ones are elsewhere, and meshes have no surface before they are read: ``immerse`` takes
+    out what is in these.
+    """
     found = {}
     for name, solid in scene.solids.items():
         shape = solid.shape
-        if shape.beam is None and shape.cavity is None and solid.initial.displacement is None:
+        if shape.beam is None and shape.mesh is None and shape.cavity is None and solid.initial.displacement is None:
             parts = {kind: getattr(shape, kind) for kind in ("box", "ball") if getattr(shape, kind) is not None}
             plain = {kind: part.model_copy(update={"cells": None}) for kind, part in parts.items()}
-            found[f"solids.{name}"] = Obstacle(shape=shape.model_copy(update=plain))
+            found[f"{BODY}{name}"] = Obstacle(shape=shape.model_copy(update=plain))
     return found
 
 

@@ -7,6 +7,7 @@ from numba import njit
 
 from petfsi.fields.sph.sight_cells import BEFORE, extent, fitting, normal_of, sorted_into
 from petfsi.fields.sph.sight_guard import cell_range, dot, in_space, minus, plus
+from petfsi.geometry.slabs import area_vectors
 from petfsi.geometry.surfaces import occurrences, ridges, shells
 
 #: Facets are sampled at this part of the reach.
@@ -26,15 +27,42 @@ def thin_facets(points: np.ndarray, facets: np.ndarray, reach: float) -> np.ndar
     facets : ndarray of int, shape (m, dim)
     reach : float
     """
-    backed = _backed(points, facets, reach)
+    behind = backed(points, facets, reach)
     part = np.zeros(len(points), dtype=bool)
-    part[facets[backed]] = True
+    part[facets[behind]] = True
     return np.all(part[facets], axis=1) | _in_open_shells(points, facets)
+
+
+def thin_shells(points: np.ndarray, facets: np.ndarray, thickness: float) -> tuple[np.ndarray, float]:
+    """Return which facets are of bodies that are thin for the most part, and how large a part of the others is thin.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n_points, dim)
+        At rest, m.
+    facets : ndarray of int, shape (m, dim)
+    thickness : float
+        Less is thin, m.
+
+    Returns
+    -------
+    thin : ndarray of bool, shape (m,)
+    part : float
+        Of the others' area.
+    """
+    if not len(facets):
+        return np.zeros(0, dtype=bool), 0.0
+    behind = thin_facets(points, facets, thickness)
+    area = np.linalg.norm(area_vectors(points, facets), axis=1)
+    label, _ = shells(points, facets)
+    thin = (np.bincount(label, behind * area) > 0.5 * np.bincount(label, area))[label]
+    rest = area[~thin].sum()
+    return thin, float(area[~thin & behind].sum() / rest) if rest > 0.0 else 0.0
 
 
 def wet_on_both_sides(points: np.ndarray, facets: np.ndarray, reach: float) -> np.ndarray:
     """Return which facets are single sheets: in open shells, with none behind them that faces away, shape (m,) bool."""
-    return _in_open_shells(points, facets) & ~_backed(points, facets, reach)
+    return _in_open_shells(points, facets) & ~backed(points, facets, reach)
 
 
 def _in_open_shells(points, facets) -> np.ndarray:
@@ -46,7 +74,7 @@ def _in_open_shells(points, facets) -> np.ndarray:
     return np.bincount(label, rim, len(volume))[label] > 0
 
 
-def _backed(points, facets, reach: float) -> np.ndarray:
+def backed(points, facets, reach: float) -> np.ndarray:
     """Return which facets have another within reach that faces away, each behind the other."""
     if not len(facets):
         return np.zeros(0, dtype=bool)

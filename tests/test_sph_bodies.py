@@ -1,0 +1,138 @@
+"""Bodies under water: still water around them, a flap that leaks nothing, walls that they do not feel. About 40 s."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from test_sph_solids import DIRECT, prepared
+
+from petfsi.bench.case import only_options
+from petfsi.errors import InputError, SolveError
+from petfsi.fields.sph.start import Start
+from petfsi.scene.load import scene_from_dict
+
+G = 9.81
+HELD = [{"where": "all", "fix": ["x", "y"]}]
+
+
+def scene(shape, end, dx=0.04, depth=1.0, solid=(), **fluid):
+    body = {"shape": shape, "density": 1000.0, "young": 1e9, "poisson": 0.3, **dict(solid or {"supports": HELD})}
+    water = {"kind": "sph", "density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.2], "spacing": dx}
+    water |= {"fill": [{"box": {"origin": [0.0, 0.0], "size": [1.0, depth]}}], "sides": {"top": "open"}, **fluid}
+    time = {"end": end, "dt": "auto", "integrator": "newmark"}
+    return scene_from_dict({"dim": 2, "gravity": [0.0, -G], "time": time, "fluid": water, "solids": {"body": body}})
+
+
+def energy(fluid):
+    mine = fluid.swarm.owned
+    return 0.5 * float(fluid.swarm["m"][mine] @ np.sum(fluid.swarm["v"][mine] ** 2, axis=1))
+
+
+def forces(sim):
+    found = []
+    while not sim.finished:
+        sim.advance()
+        found.append(sim.fluid.skin.force.sum(axis=0))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("origin, size", [((0.32, 0.4), (0.32, 0.24)), ((0.337, 0.413), (0.33, 0.21))])
+def test_water_around_a_held_box_stays_still_and_bears_it(origin, size):
+    """Seen twice from beyond its corners, the box drove currents of 8 J, and was borne by two thirds of its water."""
+    with only_options(DIRECT):
+        sim = prepared(scene({"box": {"origin": list(origin), "size": list(size), "cells": [4, 4]}}, 1.0))
+        force = forces(sim)[-200:].mean(axis=0)
+    assert energy(sim.fluid) < 1e-5 * 1000.0 * G
+    assert force[1] == pytest.approx(1000.0 * G * size[0] * size[1], rel=0.02)
+    assert abs(force[0]) < 5e-3 * force[1]
+
+
+def test_a_plate_of_no_thickness_under_water_lasts():
+    """Its currents were ever faster, and the run ended within a second."""
+    beam = {"beam": {"start": [0.48, 0.2], "end": [0.48, 0.8], "thickness": 0.004, "elements": 10}}
+    held = {"supports": [{"where": "all", "fix": ["x", "y", "angle"]}], "young": 1e12}
+    with only_options(DIRECT):
+        sim = prepared(scene(beam, 1.1, solid=held))
+        force = forces(sim)
+    assert energy(sim.fluid) < 3e-4 * 1000.0 * G
+    assert abs(force[len(force) // 2 :, 0].mean()) < 0.01 * 1000.0 * G * 0.6
+
+
+def flap(amplitude, hinge=0.1, length=0.48, dx=0.024):
+    turn = f"{amplitude}*sin(2*pi*t)"
+    x = f"(y-{hinge})*sin({turn}) + (x-1)*(cos({turn})-1)"
+    y = f"(y-{hinge})*(cos({turn})-1) - (x-1)*sin({turn})"
+    everywhere = {"box": {"origin": [0.9, 0.0], "size": [0.2, 1.0]}}
+    swung = {"supports": [{"where": everywhere, "fix": ["x", "y"], "displacement": {"x": x, "y": y}}]}
+    shape = {"box": {"origin": [0.995, hinge], "size": [0.01, length], "cells": [1, 24]}}
+    fill = [{"box": {"origin": [0.0, 0.0], "size": [2.0, 0.5]}}]
+    return scene(shape, 0.6, dx, solid=swung, size=[2.0, 1.0], fill=fill)
+
+
+def test_a_flap_swung_in_water_lets_nothing_through():
+    """At 0.9 m/s, 0.3 rad at 1 Hz; whether something crosses it is seen in the frame that turns with it."""
+    hinge, length, amplitude = 0.1, 0.48, 0.3
+
+    def turned(fluid, t):
+        a, x = amplitude * np.sin(2 * np.pi * t), fluid.swarm["x"] - [1.0, hinge]
+        order = np.argsort(fluid.swarm["id"])
+        across, along = x[:, 0] * np.cos(a) - x[:, 1] * np.sin(a), x[:, 0] * np.sin(a) + x[:, 1] * np.cos(a)
+        return across[order], along[order]
+
+    with only_options(DIRECT):
+        sim = prepared(flap(amplitude), MPI.COMM_SELF)
+        before, leaks, nearest = turned(sim.fluid, 0.0), 0, np.inf
+        while not sim.finished:
+            sim.advance()
+            now = turned(sim.fluid, sim.time)
+            crossed = np.flatnonzero(before[0] * now[0] < 0.0)
+            part = before[0][crossed] / (before[0][crossed] - now[0][crossed])
+            where = before[1][crossed] + part * (now[1] - before[1])[crossed]
+            leaks += np.count_nonzero((where > 0.0) & (where < length))
+            nearest = min(nearest, np.abs(now[0][(now[1] > 0) & (now[1] < length)]).min())
+            before = now
+    assert leaks == 0
+    assert nearest < 0.024  # there was something to let through
+    assert sim.fluid.law.pressure(sim.fluid.swarm["rho"]).max() < 3.0 * 1000.0 * G * 0.5
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_body_that_goes_into_the_floor_stops_the_run():
+    box = {"box": {"origin": [0.4, 0.12], "size": [0.2, 0.2], "cells": [2, 2]}}
+    with only_options(DIRECT):
+        sim = prepared(scene(box, 1.0, solid={"density": 5000.0, "initial": {"velocity": [0.0, -1.0]}}))
+        with pytest.raises(SolveError, match=r"gone into a wall: a point of it is at \(.*, -0.0"):
+            while not sim.finished:
+                sim.advance()
+
+
+def test_sound_that_is_too_slow_is_remarked_on_once():
+    box = {"box": {"origin": [0.4, 0.4], "size": [0.2, 0.2], "cells": [2, 2]}}
+    told = []
+    with only_options(DIRECT):
+        sim = prepared(scene(box, 0.05, sound_speed=6.0))
+        sim.report = told.append
+        while not sim.finished:
+            sim.advance()
+    assert len(told) == 1 and "fluid.sound_speed = 6 m/s is too low" in told[0]
+
+
+def test_an_obstacle_too_thin_to_part_water_is_told_of():
+    def notes(width):
+        wall = {"shape": {"box": {"origin": [0.48, 0.0], "size": [width, 1.2]}}}
+        water = {"kind": "sph", "density": 1.0, "origin": [0.0, 0.0], "size": [1.0, 1.2], "spacing": 0.04}
+        water["fill"] = [{"box": {"origin": [0.0, 0.0], "size": [1.0, 0.8]}}]
+        time = {"end": 1.0, "dt": "auto"}
+        table = {"dim": 2, "gravity": [0.0, -G], "time": time, "fluid": water, "obstacles": {"wall": wall}}
+        return [note for note in Start(scene_from_dict(table)).notes if "thinner" in note]
+
+    assert "obstacles.wall: is thinner than particles see, 0.12 m" in notes(0.08)[0]
+    assert not notes(0.16)
+
+
+def test_an_obstacle_is_not_called_like_a_side():
+    table = {"dim": 2, "time": {"end": 1.0, "dt": "auto"}, "obstacles": {"left": {"shape": {"ball": {}}}}}
+    table["obstacles"]["left"]["shape"]["ball"] = {"centre": [0.5, 0.5], "radius": 0.1}
+    table["fluid"] = {"kind": "sph", "density": 1.0, "origin": [0.0, 0.0], "size": [1.0, 1.2], "spacing": 0.04}
+    table["fluid"] |= {"sound_speed": 1.0, "fill": [{"box": {"origin": [0.0, 0.0], "size": [1.0, 0.8]}}]}
+    with pytest.raises(InputError, match="'left' is a side of the fluid"):
+        scene_from_dict(table)
