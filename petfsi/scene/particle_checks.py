@@ -24,6 +24,24 @@ def particles(scene: Scene) -> Iterator[Problem]:
         yield from plain_shape(f"fluid.fill.{n}", shape, scene.dim)
     if is_measured(fluid, scene.dim):
         yield from _spacing(fluid, scene.dim)
+    yield from _viscosity(scene, fluid)
+
+
+def why_explicit(scene: Scene) -> tuple[str, str] | None:
+    """Return why the viscosity of particles cannot be solved for, and the key that says so; None if it can."""
+    assert isinstance(scene.fluid, SphFluid)
+    if scene.fluid.viscosity == 0:
+        return "there is none to solve for", "fluid.viscosity"
+    if scene.solids:
+        return "solids want it explicit", "solids"
+    return None
+
+
+def _viscosity(scene: Scene, fluid: SphFluid) -> Iterator[Problem]:
+    """Judge whether viscosity can be solved for, if it shall be."""
+    reason = why_explicit(scene)
+    if fluid.viscosity_solve == "implicit" and reason:
+        yield Problem("fluid.viscosity_solve", "implicit", f"cannot be: {reason[0]}", (reason[1],))
 
 
 def _spacing(fluid: SphFluid, dim: int) -> Iterator[Problem]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from petfsi.fields.sph.dummies import Domain, Dummies, wall_dummies
 from petfsi.fields.sph.fill import hydrostatic, liquid
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.solids import nearest, pseudonormals
-from petfsi.scene import fluids
+from petfsi.scene import fluids, particle_checks
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Obstacle, Scene
 from petfsi.scene.shape_checks import OPPOSITE
@@ -20,6 +21,8 @@ from petfsi.scene.shape_checks import OPPOSITE
 MACH = 10.0
 #: Parts of the limits on the step: sound, viscosity, forces. The scheme's bounds are 1.2 and, for the second, 0.23.
 ACOUSTIC, VISCOUS, FORCED = 0.9, 0.2, 0.25
+#: Viscosity is solved for where its limit on explicit steps is below this part of sound's.
+IMPLICIT = 0.25
 #: With less smoothing the kernel's sums are off by more than a hundredth, and pressures with them.
 SMOOTH = {"wendland": 1.4, "quadratic": 1.2, "cubic": 1.1}
 
@@ -30,6 +33,8 @@ class Start:
     Attributes
     ----------
     law : Law
+    implicit : bool
+        Whether viscosity is solved for.
     x, v : ndarray, shape (n, dim)
         m, m/s.
     rho, m : ndarray, shape (n,)
@@ -61,6 +66,7 @@ class Start:
         nu, s = fluid.viscosity / fluid.density, fluid.smoothing * fluid.spacing
         terms = {"alpha": fluid.alpha, "nu": nu, "delta": fluid.density_diffusion}
         self.law = Law(scene.dim, fluid.density, c, s, fluid.spacing, fluid.kernel, tuple(gravity.tolist()), **terms)
+        self.implicit = self._is_implicit()
         p = np.zeros(len(self.x))
         if fluid.pressure == "hydrostatic":
             p = hydrostatic(self.x, gravity, self.law, self._domain.periodic, found.is_solid)
@@ -93,8 +99,38 @@ class Start:
             raise InputError("fluid.sound_speed: must be given (m/s), for nothing falls or moves at the start")
         return MACH * fastest
 
+    def _is_implicit(self) -> bool:
+        """Return whether viscosity is solved for: as the scene says, or where it would shorten steps by far."""
+        choice = self._fluid.viscosity_solve
+        if choice != "auto" or particle_checks.why_explicit(self._scene):
+            return choice == "implicit"
+        every = self._every_limit()
+        return every["viscosity"] < IMPLICIT * every["sound"]
+
+    @property
+    def explicit_law(self) -> Law:
+        """The law without what is solved for."""
+        return replace(self.law, nu=0.0) if self.implicit else self.law
+
     def limits(self) -> dict[str, float]:
         """Return what limits the step at the start by name, s."""
+        every = self._every_limit()
+        return {name: limit for name, limit in every.items() if not (self.implicit and name == "viscosity")}
+
+    def viscosity_story(self) -> str:
+        """Return how viscosity is stepped, and why."""
+        every, reason = self._every_limit(), particle_checks.why_explicit(self._scene)
+        how = "implicit" if self.implicit else "explicit"
+        if self._fluid.viscosity_solve != "auto":
+            why = "as fluid.viscosity_solve says"
+        elif reason:
+            why = reason[0]
+        else:
+            why = f"the first is {'' if self.implicit else 'not '}below {IMPLICIT:g} of the second"
+        numbers = f"{every['viscosity']:.3g} s, by sound {every['sound']:.3g} s"
+        return f"{how}; explicit steps are limited by viscosity to {numbers}: {why}"
+
+    def _every_limit(self) -> dict[str, float]:
         fastest = float(np.linalg.norm(self.v, axis=1).max())
         return limits(self.law, fastest, float(np.linalg.norm(self.law.gravity)))
 
