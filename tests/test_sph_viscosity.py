@@ -62,7 +62,7 @@ def test_pairs_drag_each_other_as_explicit_ones(dim):
     forces = [Passes(replace(fluid.law, nu=nu)) for nu in (fluid.law.nu, 0.0)]
     p = fluid.law.pressure(swarm["rho"])
     whole, without = (passes.forces(fluid._rows(), p, fluid.pairs, *walls) for passes in forces)
-    drag = viscous.drag(swarm, owned(sim, "v").ravel(), walls)
+    drag = viscous.drag(swarm, owned(sim, "v").ravel(), [(walls[0], fluid.walls.solved)])
     mine, largest = swarm.owned, np.abs(whole.f).max()
     np.testing.assert_allclose(drag.f[mine], (whole.f - without.f)[mine], atol=1e-12 * largest)
     seen = whole.f_walls[0] - without.f_walls[0]

@@ -271,7 +271,7 @@ class SphFluid(FluidField):
         moves.kick(self.swarm["v"], self.swarm["a"], dt / 2)
         if self.viscous is not None:
             sets = self._sets()
-            forces, lost = self.viscous.kick(self.swarm, x, [walls.met for walls in sets], dt)
+            forces, lost = self.viscous.kick(self.swarm, x, [(walls.met, walls.solved) for walls in sets], dt)
             for walls, force in zip(sets, forces, strict=True):
                 walls.take_drag(force)
             self._dissipated += lost

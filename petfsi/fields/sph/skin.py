@@ -52,10 +52,10 @@ class Skin:
         On each point at the end of the last step, N: state.
     impulse : ndarray, shape (n_points, dim)
         What points got in the step from particles that were put back, kg m/s.
+    solution : ndarray, shape (n_points, dim)
+        The velocity that the last step was solved for, by the maps of that step, m/s.
     drag : ndarray, shape (n, dim)
         On each wall particle in the last step by viscosity, where that is solved for, N.
-    given : ndarray, shape (n_points, dim)
-        What is prescribed of the velocity of each point, m/s.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Skin:
         self._no_slip = np.full(count, no_slip)
         self._period = np.where(grid.periodic, grid.counts * grid.side, 0.0)
         self.force, self.last, self.impulse = np.zeros((count, dim)), np.zeros_like(points), np.zeros_like(points)
-        self.drag, self.given = np.zeros((count, dim)), np.zeros_like(points)
+        self.drag, self.solution = np.zeros((count, dim)), np.zeros_like(points)
         self._lists = PairLists()
         self._anchor = points
         self._met: Met | None = None
@@ -190,11 +190,13 @@ class Skin:
 
     @property
     def known(self) -> np.ndarray:
-        """What is known of the velocities of the rows before a step is solved, shape (n, dim), m/s.
+        """What is known of the velocities of the rows before a step is solved, shape (n, dim): nothing."""
+        return np.zeros((len(self.rows), self.x.shape[1]))
 
-        That of points whose motion is prescribed, as a coupling has it; the others are unknowns.
-        """
-        return self.at_feet(self.given)[self.rows]
+    @property
+    def solved(self) -> np.ndarray:
+        """The velocities of the rows that a step was solved for, shape (n, dim), m/s."""
+        return self.at_feet(self.solution)[self.rows]
 
     def _gathered(self, values: np.ndarray) -> np.ndarray:
         """Return on all ranks what the owners of wall particles have of them; zero of those in no one's cells."""

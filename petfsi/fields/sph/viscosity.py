@@ -150,20 +150,22 @@ class ImplicitViscosity:
         self._fresh = False
         self.rhs, self.guess = push[self.rows].ravel(), self._before[self.rows].ravel()
 
-    def drag(self, swarm: Swarm, x: np.ndarray, walls: Sequence[Met]) -> Drag:
-        """Return the forces of pairs at the solution x (layout.n_local,), m/s. Collective."""
+    def drag(self, swarm: Swarm, x: np.ndarray, walls: Sequence[tuple[Met, np.ndarray]]) -> Drag:
+        """Return the forces of pairs at the solution x (layout.n_local,), and at that of the walls, m/s. Collective."""
         assert self._pairs is not None
         swarm["w"][self.rows] = x.reshape(-1, self.dim)
         swarm.exchange("w")
         w = swarm["w"]
-        found = Drag(np.zeros_like(w), [np.zeros_like(met.rows.x) for met in walls], np.zeros(len(w)))
+        found = Drag(np.zeros_like(w), [np.zeros_like(v) for _, v in walls], np.zeros(len(w)))
         _drag(*self._pairs, self.c, w, found.f)
-        for met, c, f_wall in zip(walls, self.c_walls, found.f_walls, strict=True):
-            _wall_drag(*met.pairs, c, w, met.rows.v, found.f, f_wall, found.given)
+        for (met, v), c, f_wall in zip(walls, self.c_walls, found.f_walls, strict=True):
+            _wall_drag(*met.pairs, c, w, v, found.f, f_wall, found.given)
         return found
 
-    def kick(self, swarm: Swarm, x: np.ndarray, walls: Sequence[Met], h: float) -> tuple[list[np.ndarray], float]:
-        """Take v'' to v_1 by the solution x. Collective.
+    def kick(
+        self, swarm: Swarm, x: np.ndarray, walls: Sequence[tuple[Met, np.ndarray]], h: float
+    ) -> tuple[list[np.ndarray], float]:
+        """Take v'' to v_1 by the solution x, and the walls'. Collective.
 
         Returns
         -------

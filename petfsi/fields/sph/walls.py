@@ -93,6 +93,11 @@ class Walls:
         """What is known of the velocities of the rows before a step is solved, shape (n, dim), m/s: all."""
         return self.met.rows.v
 
+    @property
+    def solved(self) -> np.ndarray:
+        """The velocities of the rows that a step was solved for, shape (n, dim), m/s."""
+        return self.met.rows.v
+
     def push(self) -> np.ndarray:
         """Return this rank's share of the force on each wall, shape (n_walls, dim), N."""
         owned, n = self._swarm.owned, len(self.names)
