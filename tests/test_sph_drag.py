@@ -59,6 +59,24 @@ def test_a_body_and_syrup_keep_their_momentum(kind):
     assert np.abs(first).max() > 0.1
 
 
+def test_a_body_in_space_keeps_its_momentum_too():
+    cube = {"origin": [0.35] * 3, "size": [0.3] * 3}
+    body = {"shape": {"box": cube | {"cells": [2, 2, 2]}}, "density": 500.0, "young": 1e5, "poisson": 0.3}
+    body["initial"] = {"velocity": ["0.3", "0.1*(x - 0.5)", "-0.2"]}
+    fluid = {"kind": "sph", "density": 1000.0, "origin": [0.0] * 3, "size": [1.0] * 3, "spacing": 0.1}
+    fluid |= {"sound_speed": 10.0, "viscosity": 3000.0, "fill": [{"box": {"origin": [0.0] * 3, "size": [1.0] * 3}}]}
+    fluid["sides"] = dict.fromkeys(("left", "right", "bottom", "top", "back", "front"), "periodic")
+    scene = scene_from_dict({"dim": 3, "time": {"end": 0.1, "dt": 0.01}, "fluid": fluid, "solids": {"body": body}})
+    with only_options(DIRECT):
+        sim = prepared(scene)
+        assert sim.fluid.has_block
+        seen = []
+        for _ in range(3):
+            sim.advance()
+            seen.append([sim.accounts.values[f"momentum.{axis}"] for axis in "xyz"])
+    assert np.ptp(seen, axis=0).max() < 1e-13 * np.abs(seen).max()
+
+
 @pytest.mark.parametrize("options, tolerance", [("monolithic.opts", 1e-8), ("split-iterated.opts", 1e-7)])
 def test_monolithic_and_split_find_what_a_factorisation_does(options, tolerance):
     scene = stirred("box", integrator="midpoint")

@@ -10,7 +10,7 @@ from test_sph import PERIODIC, SELF, SQUARE, VORTICES, WORLD, Stored, owned, pre
 from petfsi import plan
 from petfsi.bench import particles_flows as flows
 from petfsi.bench.case import dense, only_options
-from petfsi.errors import InputError
+from petfsi.errors import InputError, SolveError
 from petfsi.fields.sph.passes import Passes
 
 
@@ -238,3 +238,11 @@ def test_auto_solves_for_viscosity_where_it_limits_steps_by_far(viscosity, choic
 def test_what_cannot_be_solved_for_is_refused():
     with pytest.raises(InputError, match=r"fluid.viscosity_solve = \"implicit\": cannot be: there is none"):
         box(2, viscosity=0.0, viscosity_solve="implicit")
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_solver_that_gives_up_stops_the_run_by_name():
+    with only_options(["-fsi_fieldsplit_particles_ksp_max_it", "2"]):
+        sim = prepared(channel(20, 0.01))
+        with pytest.raises(SolveError, match=r"'fsi_fieldsplit_particles_' stopped with DIVERGED.*by field: particles"):
+            sim.advance()
