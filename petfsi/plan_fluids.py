@@ -98,16 +98,14 @@ def _sph(scene: Scene) -> FluidPlan:
     neighbours = PARTICLE_NEIGHBOURS[dim] * (law.s / law.spacing / 1.5) ** dim
     size = n * (PARTICLE_BYTES[dim] + (unknowns > 0) * neighbours * (2 * dim * ENTRY_BYTES + 16))
     size += n_walls * PARTICLE_BYTES[dim]
-    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), _sph_skipped(scene, start.implicit))
+    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
 
 
-def _sph_skipped(scene: Scene, implicit: bool | None = None) -> list[str]:
+def _sph_skipped(scene: Scene) -> list[str]:
+    from petfsi.fields.sph.start import Start
+
     fluid = scene.fluid
     assert isinstance(fluid, SphFluid)
-    if implicit is None:
-        from petfsi.fields.sph.start import Start
-
-        implicit = Start(scene).implicit
     out = ["viscous terms: viscosity is 0"] if fluid.viscosity == 0 else []
     if fluid.alpha == 0:
         out.append("artificial viscosity: its coefficient is 0")
@@ -117,7 +115,7 @@ def _sph_skipped(scene: Scene, implicit: bool | None = None) -> list[str]:
         out.append("shifting: it is turned off")
     if not scene.obstacles:
         out.append("obstacles: there are none")
-    if not scene.solids and not implicit:
+    if not scene.solids and not (fluid.viscosity > 0 and Start(scene).implicit):
         out.append("solver: particles are explicit, and nothing else is there; no option under -fsi_ is read")
     return out
 
