@@ -249,6 +249,7 @@ def _prefixes() -> list[str]:
         (f"{PREFIX}snes_", "how often it is linearised: ..type ksponly | newtonls"),
         (field_prefix("solid"), "the solid's block in it, or a scene without fluid"),
         (field_prefix("pressure"), "the pressure's block in it, or a scene without solids"),
+        (field_prefix("particles"), "the velocities of particles, where their viscosity is solved for"),
     ]
     return ["solvers:", *(f"  -{prefix:<27}{text}" for prefix, text in rows)]
 

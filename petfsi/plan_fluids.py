@@ -17,6 +17,8 @@ PRECONDITIONER = 3.0
 ENTRY_BYTES = 12
 #: Bytes that a particle takes with its list of pairs, by dimension.
 PARTICLE_BYTES = {2: 400, 3: 700}
+#: Particles that one sees at the default smoothing, with the skin, by dimension.
+PARTICLE_NEIGHBOURS = {2: 28, 3: 106}
 
 
 @dataclass(frozen=True)
@@ -85,18 +87,28 @@ def _sph(scene: Scene) -> FluidPlan:
     assert isinstance(scene.fluid, SphFluid)
     start, dim = Start(scene), scene.dim
     n, n_walls, law = len(start.x), len(start.dummies().x), start.law
-    rows = [("particles", f"{n:,} of {law.spacing:g} m, and {n_walls:,} in walls; no unknowns: they are explicit")]
+    unknowns = dim * n if start.implicit else 0
+    solved = f"{unknowns:,} unknowns, their velocities" if start.implicit else "no unknowns: they are explicit"
+    rows = [("particles", f"{n:,} of {law.spacing:g} m, and {n_walls:,} in walls; {solved}")]
     limits = ", ".join(f"{name} {limit:.3g} s" for name, limit in start.limits().items())
     rows.append(("sound", f"{law.c:.4g} m/s; limits on the step at the start: {limits}"))
     hold = "hold back what is drawn away from them" if law.suction else "let go what is drawn away from them"
     why = "" if scene.fluid.suction is not None else ": no" if law.suction else ": a"
     rows.append(("walls", hold + (why and f"{why} free surface at the start")))
     rows += [("sides", told) for told in [*map(str, start.inlets), *map(str, start.plates)]]
+    if law.nu > 0:
+        rows.append(("viscosity", start.viscosity_story()))
     rows += [("note", note) for note in start.notes]
-    return FluidPlan(rows, 0, float((n + n_walls) * PARTICLE_BYTES[dim]), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
+    # a row of the matrix, the same in Python and in PETSc, and where pairs go in it
+    neighbours = PARTICLE_NEIGHBOURS[dim] * (law.s / law.spacing / 1.5) ** dim
+    size = n * (PARTICLE_BYTES[dim] + (unknowns > 0) * neighbours * (2 * dim * ENTRY_BYTES + 16))
+    size += n_walls * PARTICLE_BYTES[dim]
+    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
 
 
 def _sph_skipped(scene: Scene) -> list[str]:
+    from petfsi.fields.sph.start import Start
+
     fluid = scene.fluid
     assert isinstance(fluid, SphFluid)
     out = ["viscous terms: viscosity is 0"] if fluid.viscosity == 0 else []
@@ -108,7 +120,7 @@ def _sph_skipped(scene: Scene) -> list[str]:
         out.append("shifting: it is turned off")
     if not scene.obstacles:
         out.append("obstacles: there are none")
-    if not scene.solids:
+    if not scene.solids and not (fluid.viscosity > 0 and Start(scene).implicit):
         out.append("solver: particles are explicit, and nothing else is there; no option under -fsi_ is read")
     return out
 

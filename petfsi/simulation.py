@@ -85,7 +85,7 @@ class Simulation:
         self.phases = dict.fromkeys(PHASES, 0.0)
 
     def _make_solver(self) -> Solver | DiagonalSolver:
-        if all(field.explicit for field in self.system.fields) and len(self.system.fields) < 2:
+        if all(field.diagonal for field in self.system.fields) and len(self.system.fields) < 2:
             return DiagonalSolver(self.system)
         return Solver(self.system, static=self.scene.time.integrator == "static")
 
@@ -155,7 +155,7 @@ class Simulation:
             outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
         with self.phase("accept"):
             self._accept(t, dt)
-            if len(self.system.fields) > 1 or not self.stable.limited:  # else no step makes any
+            if not isinstance(self.solver, DiagonalSolver):  # else no step makes any
                 petsc.collect_garbage()
         self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
 

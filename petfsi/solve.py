@@ -417,7 +417,8 @@ class Solver:
             self._ksp.getPC().apply(self.system.rhs, self.system.residual)
         except PETSc.Error as error:
             raise InputError(option_story(self.prefix, error)) from None
-        unread = petsc.unread_options(PREFIX)
+        absent = tuple(map(field_prefix, {*SHIPPED} - {field.name for field in self.system.fields}))
+        unread = [name for name in petsc.unread_options(PREFIX) if not name.startswith(absent)]
         if not self.system.index_sets:  # options of the others wait for a scene that couples
             others = f"{PREFIX}fieldsplit_" if self.prefix == PREFIX else "-"
             mine = (self.prefix, f"{PREFIX}snes_")
@@ -443,6 +444,8 @@ def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
     ksp.destroy()
 
 
+#: Fields that the shipped files have options for, whether they are in a scene or not.
+SHIPPED = ("solid", "pressure", "particles")
 #: How the names of options end that mean nothing without a value.
 VALUED = ("_type", "_rtol", "_atol", "_stol", "_divtol", "_max_it")
 #: Names worth suggesting for a misspelt option, besides those in force.

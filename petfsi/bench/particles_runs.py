@@ -25,6 +25,8 @@ def box(size: list[float]) -> list[dict]:
 def prepared(comm: MPI.Comm, end: float, size: list[float], gravity: list[float], **fluid: Any) -> Simulation:
     """Return a simulation of particles in a box that begins at the origin, at its start. Collective.
 
+    Where viscosity is solved for, petfsi's options must be in force while it runs (``case.only_options``).
+
     Parameters
     ----------
     comm : MPI.Comm
@@ -35,10 +37,12 @@ def prepared(comm: MPI.Comm, end: float, size: list[float], gravity: list[float]
     gravity : list of float
         m/s^2.
     **fluid
-        The rest of the scene's table; density ``DENSITY`` if it says nothing of it.
+        The rest of the scene's table; density ``DENSITY`` if it says nothing of it. Of ``time``, what the
+        scene says of that besides the end; by default steps are as long as they may be.
     """
-    table = {"kind": "sph", "density": DENSITY, "origin": [0.0] * len(size), "size": size} | fluid
-    data = {"dim": len(size), "gravity": gravity, "time": {"end": end, "dt": "auto"}, "fluid": table}
+    table: dict[str, Any] = {"kind": "sph", "density": DENSITY, "origin": [0.0] * len(size), "size": size} | fluid
+    data = {"dim": len(size), "gravity": gravity, "fluid": table}
+    data["time"] = {"end": end, "dt": "auto"} | table.pop("time", {})
     scene = on_root(comm, lambda: scene_from_dict(data))
     with only_options([]):
         sim = Simulation(comm, scene)

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi.fields.base import PressureFluid, SolidField
+from petfsi.fields.base import FluidField, SolidField
 from petfsi.petsc import new_block, set_csr
 
 #: This rank's rows of a matrix: indptr, global columns, values.
@@ -24,7 +24,7 @@ class TransferBlocks:
         -J: rows of the solid.
     """
 
-    def __init__(self, comm: MPI.Comm, fluid: PressureFluid, solid: SolidField) -> None:
+    def __init__(self, comm: MPI.Comm, fluid: FluidField, solid: SolidField) -> None:
         self._comm = comm
         self.flux = new_block(comm, fluid.layout, solid.layout)
         self.force = new_block(comm, solid.layout, fluid.layout)

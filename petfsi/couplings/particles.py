@@ -23,6 +23,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
+from petfsi.couplings.drag import Drag
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.sph.fluid import SphFluid
 from petfsi.geometry.surfaces import Surface
@@ -31,7 +32,7 @@ from petfsi.scene import schema
 
 
 class PressureTransfer(Coupling):
-    """Pressure (and drag) of wall particles on a solid: K_w in its block, no block off the diagonal.
+    """Pressure (and drag) of wall particles on a solid: K_w in its block, and off the diagonal what ``drag`` says.
 
     Parameters
     ----------
@@ -42,9 +43,10 @@ class PressureTransfer(Coupling):
 
     def __init__(self, fluid: SphFluid, solid: SolidField, spec: schema.Coupling) -> None:
         self.fluid, self.solid, self.comm = fluid, solid, fluid.comm
-        self.blocks: dict[tuple[str, str], PETSc.Mat] = {}
         surface = solid.surface()
         self.skin = fluid.immerse(solid.surface_present(), surface.facets)
+        self.drag = Drag(fluid, solid, fluid.viscous) if fluid.viscous is not None else None
+        self.blocks: dict[tuple[str, str], PETSc.Mat] = {} if self.drag is None else self.drag.blocks
         self._take(surface)
         self._mean = self.skin.last
         self.theta = THETA.get(fluid.scene.time.integrator, 1.0)
@@ -71,12 +73,16 @@ class PressureTransfer(Coupling):
         self.solid.take_mass(None if self.solid.explicit else self._stiffening())
 
     def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return this rank's rows of K_w, as far as it counts in this step. Collective."""
+        """Return this rank's rows of K_w, as far as it counts in this step, and of the drag's. Collective."""
         rows = (self._answer.rows @ self.surface.point_map).tocsr()
         weighted = rows.multiply(self.theta * self._answer.weight[:, None]).tocsr()
         product = (rows.T @ weighted).tocoo()
         self._unknown_rows = rows
-        return gather_triplets(self.comm, self.solid.layout, product.row, product.col, product.data)
+        i, j, values = product.row, product.col, product.data
+        if self.drag is not None:
+            parts = zip((i, j, values), self.drag.weigh(self.surface), strict=True)
+            i, j, values = (np.concatenate(part) for part in parts)
+        return gather_triplets(self.comm, self.solid.layout, i, j, values)
 
     def assemble(self, time: float, dt: float) -> None:
         """Add the force of the step to the solid's right-hand side, at the velocity that densities saw. Collective."""
@@ -93,6 +99,9 @@ class PressureTransfer(Coupling):
         part = self._unknown_rows.T @ (self.theta * self._answer.weight * (self._answer.rows @ seen))
         here = np.flatnonzero(part)
         self.solid.rhs += gather_sums(self.comm, self.solid.layout, here, part[here])
+        if self.drag is not None:
+            self.pattern_version += self.drag.assemble()
+            self.blocks = self.drag.blocks
 
     def inject(self, volume: np.ndarray) -> None:
         """Do nothing: particles fill no cells."""
@@ -105,7 +114,8 @@ class PressureTransfer(Coupling):
         if not self.surface.fixed_map.nnz or self.comm.rank:
             return Work()
         held = self.surface.fixed_map @ self.solid.fixed_velocity()
-        return Work(boundary=-dt * float(self._mean.ravel() @ held))
+        force = self._mean + self.skin.to_points(self.skin.drag)
+        return Work(boundary=-dt * float(force.ravel() @ held))
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give particles what the new velocity changes, and tell the fluid where the surface is. Collective."""
@@ -116,6 +126,7 @@ class PressureTransfer(Coupling):
         self.comm.Allreduce(change, total)
         total = total.reshape(-1, self.fluid.dim)
         self._mean = self._mean + self.theta * total
+        self.skin.solution = new.reshape(-1, self.fluid.dim)
         self.skin.last = self.skin.to_points(self.skin.force) + total
         self.restored()
 

@@ -114,9 +114,11 @@ class Field(ABC):
     explicit, elastic : bool
         Whether its step is limited, see ``stable_step``; whether it stores energy.
     layout : Layout
-        How its unknowns lie on the ranks.
+        How its unknowns lie on the ranks; ``assemble`` may change it, and couplings and the system follow.
+    diagonal : bool
+        Whether the block has no entry off its diagonal.
     block : PETSc.Mat
-        The diagonal block, AIJ; the same object for the whole run, SI units.
+        The diagonal block, AIJ, SI units; another object only where the layout has changed.
     rhs : ndarray, shape (layout.n_local,)
         Right-hand side, SI units; couplings may add to it between ``assemble`` and the solve.
     row_scale, col_scale : float
@@ -132,6 +134,7 @@ class Field(ABC):
     has_block: bool = True
     explicit: bool = False
     elastic: bool = False
+    diagonal: bool = False
     layout: Layout
     block: PETSc.Mat
     rhs: np.ndarray

@@ -60,7 +60,7 @@ class JointSolid(SolidField):
         for kind, make in fields.items():
             own = {name: solid for name, solid in scene.solids.items() if kinds[name] == kind}
             self.parts.append(make(comm, scene.model_copy(update={"solids": own})))
-        self.explicit = self.parts[0].explicit
+        self.explicit = self.diagonal = self.parts[0].explicit
         self.is_linear = all(part.is_linear for part in self.parts)
         self.extent = self._largest_side()
         counts = [part.layout.n_local for part in self.parts]

@@ -186,6 +186,9 @@ class SphFluid(FluidTable):
     kernel: Literal["wendland", "quadratic", "cubic"] = "wendland"
     sound_speed: Annotated[Real | None, Field(gt=0, le=1e6, description="m/s")] = None
     viscosity: Annotated[Real, Field(ge=0, description="Pa s")] = 0.0
+    viscosity_solve: Annotated[
+        Literal["auto", "explicit", "implicit"], Field(description="auto: implicit where it limits steps by far")
+    ] = "auto"
     artificial_viscosity: Annotated[Real | None, Field(ge=0, description="Monaghan's alpha")] = None
     density_diffusion: Annotated[Real, Field(ge=0, le=1, description="delta of delta-SPH; 0 is none")] = 0.1
     shifting: Flag = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from petfsi.scene.fluids import MovingSide, SphFluid
+from petfsi.scene.fluids import InflowSide, MovingSide, SphFluid
 from petfsi.scene.mistakes import Problem
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import MAX_CELLS, OPPOSITE, is_measured, length, periods, plain_shape
@@ -25,6 +25,29 @@ def particles(scene: Scene) -> Iterator[Problem]:
     if is_measured(fluid, scene.dim):
         yield from _spacing(fluid, scene.dim)
     yield from _plates(fluid, scene.dim)
+    yield from _viscosity(scene, fluid)
+
+
+def why_explicit(scene: Scene) -> tuple[str, str] | None:
+    """Return why the viscosity of particles cannot be solved for, and the key that says so; None if it can."""
+    assert isinstance(scene.fluid, SphFluid)
+    if scene.fluid.viscosity == 0:
+        return "there is none to solve for", "fluid.viscosity"
+    if scene.solids and scene.time.integrator == "symplectic-euler":
+        return "symplectic-euler solves for nothing", "time.integrator"
+    if scene.solids and scene.transfer == "repulsion":
+        return "repulsion has no drag to solve for", "coupling.transfer"
+    sides = (getattr(scene.fluid.sides, side) for pair in OPPOSITE[: scene.dim] for side in pair)
+    if any(isinstance(side, InflowSide) for side in sides):
+        return "what comes in has its velocity prescribed", "fluid.sides"
+    return None
+
+
+def _viscosity(scene: Scene, fluid: SphFluid) -> Iterator[Problem]:
+    """Judge whether viscosity can be solved for, if it shall be."""
+    reason = why_explicit(scene)
+    if fluid.viscosity_solve == "implicit" and reason:
+        yield Problem("fluid.viscosity_solve", "implicit", f"cannot be: {reason[0]}", (reason[1],))
 
 
 def _plates(fluid: SphFluid, dim: int) -> Iterator[Problem]:

@@ -76,7 +76,7 @@ class NodalSolid(SolidField):
         self.names = list(solids)
         self.extent = float(np.ptp(mesh.points, axis=0).max())
         self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
-        self.explicit = self._integrator.explicit
+        self.explicit = self.diagonal = self._integrator.explicit
         if self.explicit:
             solids = {name: solid.model_copy(update={"mass": "lumped"}) for name, solid in solids.items()}
         self._node_body = np.empty(len(mesh.points), dtype=np.int32)

@@ -6,7 +6,8 @@ With the law of ``passes`` (D the rate of density, f the forces), h the step and
     x = x' + h/2 v' - shift        a = f(x, v', rho)/m + g        v = v' + h/2 a
 
 so each pair is visited twice a step. It is of second order and, without viscosity, diffusion and shifting, symplectic.
-The equations have no unknowns that must be solved for: the field has no block.
+The equations have no unknowns that must be solved for, and the field has no block, unless viscosity is solved for: then
+f is without it, and the last kick holds what ``viscosity`` says of the whole step.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from petfsi.fields.sph.sight import Sight
 from petfsi.fields.sph.skin import Skin
 from petfsi.fields.sph.start import Start, depth_behind, limits
 from petfsi.fields.sph.thin import thin_shells, wet_on_both_sides
+from petfsi.fields.sph.viscosity import THETA, ImplicitViscosity
 from petfsi.fields.sph.walls import Walls
+from petfsi.geometry.bodies import enclosed
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
@@ -44,7 +47,7 @@ GAP, FEW, MOST = 0.1, 10, 1000
 CLEARANCE = 0.25
 #: Bodies thinner than so many spacings for the most part hide one side from the other, and have two sets of wall
 #: particles; if so large a part of the others' surface is as thin, that is told.
-THIN, PARTLY = 1.75, 0.02
+THIN, PARTLY = 1.75, 0.3
 #: A point nearer than so many spacings to a wall particle that is a spacing or more inside is there, too.
 SUNK = 0.6
 #: Speeds above this part of that of sound, and densities off by more than this part, are remarked on.
@@ -77,6 +80,8 @@ class SphFluid(FluidField):
         The box, its sides, and the grid of cells.
     openings : Openings
         What comes and goes through the sides.
+    viscous : ImplicitViscosity or None
+        The block, if viscosity is solved for.
     """
 
     name = "particles"
@@ -91,12 +96,13 @@ class SphFluid(FluidField):
         self.density, self.spacing = start.law.rho0, start.law.spacing
         self.cell_volume = self.spacing**self.dim
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
-        self.passes, self._lists = Passes(self.law), PairLists()
-        vector = (self.dim, np.float64)
-        columns = {"v": vector, "rho": ((), np.float64), "m": ((), np.float64)}
-        self.swarm = Swarm(
-            comm, self.room.grid, {**columns, "a": vector, "S": vector, "anchor": vector, "origin": vector}
-        )
+        self.passes, self._lists = Passes(start.explicit_law), PairLists()
+        vector, number = (self.dim, np.float64), ((), np.float64)
+        columns: dict[str, tuple[int | tuple[()], type]] = {"v": vector, "rho": number, "m": number}
+        columns |= dict.fromkeys(("a", "S", "anchor", "origin"), vector)
+        if start.implicit:
+            columns |= {"w": vector, "number": ((), np.int64)}
+        self.swarm = Swarm(comm, self.room.grid, columns)
         rows = start.rows(slice(comm.rank, None, comm.size))
         boxes = bisect(comm, self.room.grid, self.room.grid.of(rows["x"]))
         self.swarm.insert(rows)
@@ -111,6 +117,11 @@ class SphFluid(FluidField):
         self.tallied: dict[str, float] = {}
         self._notes, self._taken = start.notes, dummies.x
         self._deep = cKDTree(dummies.x[dummies.depth > self.spacing])
+        self.viscous: ImplicitViscosity | None = None
+        if start.implicit:
+            self.viscous = ImplicitViscosity(comm, self.swarm, THETA.get(scene.time.integrator, 1.0))
+            self.has_block = True
+            self._take_block()
         self.swarm["a"][:] = self.gravity(0.0)
         self._warned = False
         self._forget_step()
@@ -148,6 +159,8 @@ class SphFluid(FluidField):
         near = CLEARANCE * self.spacing
         depth = depth_behind(self.swarm["x"], points, facets, self.room.reach)
         inside = self.swarm.owned & (depth > -near)
+        far = np.flatnonzero(self.swarm.owned & np.isneginf(depth))
+        inside[far] = enclosed(points, facets, self.swarm["x"][far])
         dropped = self.comm.allreduce(int(np.count_nonzero(inside)))
         if dropped:
             self.swarm.remove(inside)
@@ -208,8 +221,26 @@ class SphFluid(FluidField):
         swarm["rho"] += dt * rates.total
 
     def assemble(self, time: float, dt: float) -> None:
-        """Find the forces, unless a coupling has asked for them already. Collective."""
+        """Find the forces, unless a coupling has asked for them already, and the block of viscosity. Collective."""
         self.push(time, dt)
+        if self.viscous is not None:
+            walls = [(walls.met, walls.known) for walls in self._sets()]
+            self.viscous.assemble(self.swarm, dt, self._half(dt), walls)
+            self._take_block()
+            self.row_scale = self.viscous.theta * dt / (self.density * self.cell_volume)
+            self.n_assembled += 1
+
+    def _half(self, dt: float) -> float:
+        """Return for how long a kick is, s."""
+        return dt / 2 if self._moving else 0.0
+
+    def _take_block(self) -> None:
+        assert self.viscous is not None
+        self.layout, self.block, self.rhs = self.viscous.layout, self.viscous.block, self.viscous.rhs
+
+    def unknown(self) -> np.ndarray:
+        """Return the velocities at the begin of the step, if viscosity is solved for."""
+        return super().unknown() if self.viscous is None else self.viscous.guess
 
     def push(self, time: float, dt: float) -> None:
         """Find the forces where the step has brought the particles and walls. Collective; once a step."""
@@ -233,6 +264,8 @@ class SphFluid(FluidField):
         mine = self.swarm.owned
         self._dissipated = dt * float(forces.dissipated[mine].sum())
         self.swarm["S"] = moves.fade(forces.S, forces.full)
+        if self.viscous is not None:
+            self.viscous.weigh(self.swarm, self.law, self.pairs, [walls.met for walls in sets], self._half(dt))
         self.swarm["a"] = forces.f / fluid.m[:, None] + self.gravity(end)
         self.openings.lead(self.swarm, self.gravity(end), end, dt)
         if not self._moving:
@@ -267,8 +300,14 @@ class SphFluid(FluidField):
         self.n_put_back += number
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
-        """Kick for the second half of the step. Collective."""
+        """Kick for the second half of the step, by viscosity for all of it if that is solved for. Collective."""
         moves.kick(self.swarm["v"], self.swarm["a"], dt / 2)
+        if self.viscous is not None:
+            sets = self._sets()
+            forces, lost = self.viscous.kick(self.swarm, x, [(walls.met, walls.solved) for walls in sets], dt)
+            for walls, force in zip(sets, forces, strict=True):
+                walls.take_drag(force)
+            self._dissipated += lost
         self._moving = False
         self._measure_speeds()
 
@@ -282,7 +321,7 @@ class SphFluid(FluidField):
             self.walls.slide(time)
         g = tuple(self.gravity(time).tolist())
         if g != self.law.gravity:
-            self.law = self.passes.law = replace(self.law, gravity=g)
+            self.law, self.passes.law = replace(self.law, gravity=g), replace(self.passes.law, gravity=g)
 
     def _refresh(self, *names: str) -> None:
         """Give ghosts these columns anew; list pairs again if particles have come too near each other. Collective.
@@ -376,7 +415,7 @@ class SphFluid(FluidField):
 
     def stable_step(self) -> float:
         """Return the smallest of the limits on the step, s."""
-        return min(limits(self.law, self._fastest, self._strongest).values())
+        return min(limits(self.passes.law, self._fastest, self._strongest).values())
 
     # ---- accounts -------------------------------------------------------------------------------------------------
 

@@ -75,6 +75,10 @@ class Met(NamedTuple):
     density: np.ndarray | None = None
     seen: np.ndarray | None = None
 
+    def parts(self) -> np.ndarray:
+        """Return ``seen``, or an array of nothing, as loops take it."""
+        return np.empty(0) if self.seen is None else self.seen
+
 
 class Rates(NamedTuple):
     """Rates of density (n,), kg/m^dim/s: all of D, and the part of it that is diffusion."""
@@ -133,7 +137,7 @@ class Passes:
         self._density(*_unsigned(pairs), rows, 1 / law.s, law.kernel.f_scale, diffusion, g, loops.LANES, *rates)
         for met in walls:
             wall = met.rows
-            args = (rows, wall.x, wall.v, wall.volume, _parts(met))
+            args = (rows, wall.x, wall.v, wall.volume, met.parts())
             add = loops.wall_density_loop(*self._which, met.seen is not None)
             add(*_unsigned(met.pairs), *args, 1 / law.s, law.kernel.f_scale, rates.total)
         return rates
@@ -144,7 +148,7 @@ class Passes:
         pressure, weight = np.zeros(walls.x.shape[0]), np.zeros(walls.x.shape[0])
         average = loops.wall_pressure_loop(*self._which, met.seen is not None)
         p = p if law.suction else np.maximum(p, 0.0)
-        args = (fluid.x, fluid.rho, p, walls.x, walls.a, _parts(met), np.array(law.gravity), 1 / law.s)
+        args = (fluid.x, fluid.rho, p, walls.x, walls.a, met.parts(), np.array(law.gravity), 1 / law.s)
         average(*_unsigned(met.pairs), *args, pressure, weight)
         return pressure
 
@@ -163,7 +167,7 @@ class Passes:
             assert met.pressure is not None and met.density is not None, "walls come with their pressure and density"
             wall, f_wall = met.rows, np.zeros_like(met.rows.x)
             state = (met.pressure / met.density**2, met.density, wall.volume)
-            place = (wall.x, wall.v, wall.normal, wall.depth, _parts(met), wall.no_slip)
+            place = (wall.x, wall.v, wall.normal, wall.depth, met.parts(), wall.no_slip)
             add = loops.wall_force_loop(*self._which, met.seen is not None)
             stop = NEAR * law.spacing, STOP * law.c**2 / law.rho0
             add(*_unsigned(met.pairs), rows, scaled, *place, *state, *constants, 4 * law.nu, *stop, sums, f_wall)
@@ -180,10 +184,6 @@ class Passes:
             self._rows, self._sums, self._scaled = np.empty((more, 8)), np.empty((more, 8)), np.empty(more)
         loops.pack(fluid.x, fluid.v, fluid.rho, fluid.m, self._rows)
         return n
-
-
-def _parts(met: Met) -> np.ndarray:
-    return np.empty(0) if met.seen is None else met.seen
 
 
 def _unsigned(pairs):

@@ -62,6 +62,10 @@ class Skin:
         On each point at the end of the last step, N: state.
     impulse : ndarray, shape (n_points, dim)
         What points got in the step from particles that were put back, kg m/s.
+    solution : ndarray, shape (n_points, dim)
+        The velocity that the last step was solved for, by the maps of that step, m/s.
+    drag : ndarray, shape (n, dim)
+        On each wall particle in the last step by viscosity, where that is solved for, N.
     """
 
     def __init__(
@@ -80,6 +84,7 @@ class Skin:
         self._inv_edge = 1.0 / (EDGE * spacing)
         self._period = np.where(grid.periodic, grid.counts * grid.side, 0.0)
         self.force, self.last, self.impulse = np.zeros((count, dim)), np.zeros_like(points), np.zeros_like(points)
+        self.drag, self.solution = np.zeros((count, dim)), np.zeros_like(points)
         self._lists = PairLists()
         self._anchor = points
         self._met: Met | None = None
@@ -209,6 +214,20 @@ class Skin:
     def take(self, force: np.ndarray) -> None:
         """Take this rank's part of the forces of the last pass. Collective."""
         self.force = self._gathered(force)
+
+    def take_drag(self, force: np.ndarray) -> None:
+        """Take this rank's part of what viscosity adds, where it is solved for. Collective."""
+        self.drag = self._gathered(force)
+
+    @property
+    def known(self) -> np.ndarray:
+        """What is known of the velocities of the rows before a step is solved, shape (n, dim): nothing."""
+        return np.zeros((len(self.rows), self.x.shape[1]))
+
+    @property
+    def solved(self) -> np.ndarray:
+        """The velocities of the rows that a step was solved for, shape (n, dim), m/s."""
+        return self.at_feet(self.solution)[self.rows]
 
     def _gathered(self, values: np.ndarray) -> np.ndarray:
         """Return on all ranks what the owners of wall particles have of them; zero of those in no one's cells."""

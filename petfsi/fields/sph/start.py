@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.plates import plates
 from petfsi.fields.sph.solids import SAME, Solid, nearest, pseudonormals
 from petfsi.fields.sph.thin import backed
-from petfsi.scene import fluids
+from petfsi.scene import fluids, particle_checks
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Obstacle, Scene
 from petfsi.scene.shape_checks import OPPOSITE
@@ -29,6 +30,8 @@ ACOUSTIC, VISCOUS, FORCED = 0.9, 0.2, 0.25
 FULL, SAMPLES = 0.9, 24
 #: What bodies are called among the obstacles that keep liquid out at the start.
 BODY = "solids."
+#: Viscosity is solved for where its limit on explicit steps is below this part of sound's.
+IMPLICIT = 0.25
 #: With less smoothing the kernel's sums are off by more than a hundredth, and pressures with them.
 SMOOTH = {"wendland": 1.4, "quadratic": 1.2, "cubic": 1.1}
 
@@ -41,6 +44,8 @@ class Start:
     law : Law
     inlets : list of Inlet
     plates : list of Plate
+    implicit : bool
+        Whether viscosity is solved for.
     x, v : ndarray, shape (n, dim)
         m, m/s; those that wait behind inflows last.
     rho, m : ndarray, shape (n,)
@@ -81,6 +86,7 @@ class Start:
         suction = self._has_no_surface(found) if fluid.suction is None else fluid.suction
         g = tuple(gravity.tolist())
         self.law = Law(scene.dim, fluid.density, c, s, fluid.spacing, fluid.kernel, g, suction=suction, **terms)
+        self.implicit = self._is_implicit()
         p = np.zeros(len(self.x))
         if fluid.pressure == "hydrostatic":
             p = hydrostatic(self.x, gravity, self.law, self._domain.periodic, found.is_solid)
@@ -145,8 +151,38 @@ class Start:
         room = size.prod() * np.mean(~found.is_solid(places))
         return bool(found.volume.sum() > FULL * room)
 
+    def _is_implicit(self) -> bool:
+        """Return whether viscosity is solved for: as the scene says, or where it would shorten steps by far."""
+        choice = self._fluid.viscosity_solve
+        if choice != "auto" or particle_checks.why_explicit(self._scene):
+            return choice == "implicit"
+        every = self._every_limit()
+        return every["viscosity"] < IMPLICIT * every["sound"]
+
+    @property
+    def explicit_law(self) -> Law:
+        """The law without what is solved for."""
+        return replace(self.law, nu=0.0) if self.implicit else self.law
+
     def limits(self) -> dict[str, float]:
         """Return what limits the step at the start by name, s."""
+        every = self._every_limit()
+        return {name: limit for name, limit in every.items() if not (self.implicit and name == "viscosity")}
+
+    def viscosity_story(self) -> str:
+        """Return how viscosity is stepped, and why."""
+        every, reason = self._every_limit(), particle_checks.why_explicit(self._scene)
+        how = "implicit" if self.implicit else "explicit"
+        if self._fluid.viscosity_solve != "auto":
+            why = "as fluid.viscosity_solve says"
+        elif reason:
+            why = reason[0]
+        else:
+            why = f"the first is {'' if self.implicit else 'not '}below {IMPLICIT:g} of the second"
+        numbers = f"{every['viscosity']:.3g} s, by sound {every['sound']:.3g} s"
+        return f"{how}; explicit steps are limited by viscosity to {numbers}: {why}"
+
+    def _every_limit(self) -> dict[str, float]:
         fastest = float(np.linalg.norm(self.v, axis=1).max())
         return limits(self.law, fastest, float(np.linalg.norm(self.law.gravity)))
 

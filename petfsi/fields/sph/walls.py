@@ -110,6 +110,20 @@ class Walls:
         """Take the forces of the last pass."""
         self.force = force
 
+    def take_drag(self, force: np.ndarray) -> None:
+        """Take what viscosity adds, where it is solved for."""
+        self.force = self.force + force
+
+    @property
+    def known(self) -> np.ndarray:
+        """What is known of the velocities of the rows before a step is solved, shape (n, dim), m/s: all."""
+        return self.met.rows.v
+
+    @property
+    def solved(self) -> np.ndarray:
+        """The velocities of the rows that a step was solved for, shape (n, dim), m/s."""
+        return self.met.rows.v
+
     def push(self) -> np.ndarray:
         """Return this rank's share of the force on each wall, shape (n_walls, dim), N."""
         owned, n = self._swarm.owned, len(self.names)
