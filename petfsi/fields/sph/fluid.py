@@ -33,8 +33,6 @@ from petfsi.fields.sph.walls import Walls
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
-#: Lists of pairs reach so much farther than particles see: they hold while no two came nearer by as much.
-SKIN = 0.05
 #: Particles that went through a thin body are put back so far before it, in spacings; if more than a few, and more than
 #: one in so many of all, did in one step, the run stops.
 GAP, FEW, MOST = 0.1, 10, 1000
@@ -76,10 +74,12 @@ class SphFluid(FluidField):
     def __init__(self, comm: MPI.Comm, scene: Scene):
         start = Start(scene)
         self.comm, self.scene, self.dim = comm, scene, scene.dim
-        self.law, self.room = start.law, Room.of(scene, start.law, SKIN)
+        self.law, self.room = start.law, Room.of(scene, start.law)
         self.density, self.spacing = start.law.rho0, start.law.spacing
         self.cell_volume = self.spacing**self.dim
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
+        constant = not any(g.depends_on_time for g in self._gravity)
+        self._constant_gravity = self._gravity_at(0.0) if constant else None
         self.passes, self._lists = Passes(self.law), PairLists()
         vector = (self.dim, np.float64)
         columns = {"v": vector, "rho": ((), np.float64), "m": ((), np.float64)}
@@ -94,7 +94,7 @@ class SphFluid(FluidField):
         self.walls = Walls(comm, self.room.grid, boxes, dummies) if len(dummies.x) else None
         self.skin: Skin | None = None
         self.sight: Sight | None = None
-        self.n_put_back = 0
+        self.n_put_back = self.n_lists = 0
         self.kept: dict[str, np.ndarray] = {}
         self.tallied: dict[str, float] = {}
         self._notes = start.notes
@@ -115,7 +115,7 @@ class SphFluid(FluidField):
         self.clear(points, facets)
         no_slip = self.law.nu > 0
         self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, no_slip)
-        reach = (1 + SKIN) * self.room.reach
+        reach = self.room.reach + self.room.near
         thin = thin_facets(points, facets, reach)
         if np.any(thin):
             both = wet_on_both_sides(points, facets, reach)
@@ -145,6 +145,9 @@ class SphFluid(FluidField):
 
     def gravity(self, t: float) -> np.ndarray:
         """Return the acceleration of gravity at a time, shape (dim,), m/s^2."""
+        return self._gravity_at(t) if self._constant_gravity is None else self._constant_gravity
+
+    def _gravity_at(self, t: float) -> np.ndarray:
         return np.array([float(g(t=t)) for g in self._gravity]) if self._gravity else np.zeros(self.dim)
 
     # ---- the step -------------------------------------------------------------------------------------------------
@@ -163,10 +166,9 @@ class SphFluid(FluidField):
         swarm = self.swarm
         self._condense(time + half, dt)
         moves.drift(swarm["x"], swarm["v"], half)
-        mine = swarm.owned
-        self._way += dt * (swarm["m"][mine] @ swarm["v"][mine])
+        self._way += dt * moves.momentum(swarm["m"], swarm["v"], swarm.owned)
         if self.room.shifting:
-            columns = swarm["x"], swarm["v"], swarm["S"], swarm["m"], mine
+            columns = swarm["x"], swarm["v"], swarm["S"], swarm["m"], swarm.owned
             shifted = np.zeros(self.dim)
             moves.shift(*columns, dt, self.law.s, moves.SLOW * self.law.c, shifted)
             self._diffused += float(shifted @ self.gravity(time + half))
@@ -204,8 +206,8 @@ class SphFluid(FluidField):
             walls.take(force)
         mine = self.swarm.owned
         self._dissipated = dt * float(forces.dissipated[mine].sum())
-        self.swarm["S"] = moves.fade(forces.S, forces.full)
-        self.swarm["a"] = forces.f / fluid.m[:, None] + self.gravity(end)
+        moves.fade(forces.S, forces.full, self.swarm["S"])
+        moves.accelerate(forces.f, fluid.m, self.gravity(end), self.swarm["a"])
         self.room.let_go(self.swarm, self.gravity(end), dt)
         self._pushed = True
 
@@ -253,25 +255,37 @@ class SphFluid(FluidField):
             self.law = self.passes.law = replace(self.law, gravity=g)
 
     def _refresh(self, *names: str) -> None:
-        """Give ghosts these columns anew; list pairs again if particles have come too near each other. Collective.
+        """Give ghosts these columns, x among them, anew; list pairs again where a list does not hold. Collective.
 
         Raises
         ------
         SolveError
             On all ranks, where a particle is nowhere, or where none can be.
         """
-        swarm = self.swarm
+        swarm, room = self.swarm, self.room
         way = moves.farthest(swarm["x"], swarm["anchor"], swarm.owned) if self._listed else np.inf
         way = max([np.inf if np.isnan(way) else way, *(walls.farthest() for walls in self._sets())])
         way = self.comm.allreduce(way, MPI.MAX)
-        if 2 * way < SKIN * self.room.reach:
+        if way < max(room.near / 2, room.wide):
             swarm.exchange(*names)
-        else:
+        if not (2 * way < room.near or (way < room.wide and self._stays_together())):
             self._list_pairs()
+
+    def _stays_together(self) -> bool:
+        """Whether particles go so much the same way that none came near that is not listed. Collective.
+
+        Those two cells apart or less are compared. Others stay apart, as none has gone farther than cells are wider
+        than particles see.
+        """
+        swarm = self.swarm
+        if len(self.scene.solids):  # what hides behind them, and where they meet particles, changes as these pass by
+            return False
+        spread = moves.spread(swarm["x"], swarm["anchor"], swarm.first, swarm.counts)
+        return self.comm.allreduce(spread, MPI.MAX) < self.room.near
 
     def _list_pairs(self) -> None:
         """Sort the particles and list their pairs. Collective."""
-        swarm, reach = self.swarm, (1 + SKIN) * self.room.reach
+        swarm, reach = self.swarm, self.room.reach + self.room.near
         self.room.release(swarm)
         self.room.check(self.comm, swarm)
         try:
@@ -284,8 +298,8 @@ class SphFluid(FluidField):
             self.sight.place(self.skin.points, swarm["x"])
             self.pairs = self.sight.strike(self.pairs, swarm["x"])
         for walls in self._sets():
-            walls.meet(swarm, reach)
-        self._listed = True
+            walls.meet(swarm, self.room.reach + self.room.wide)
+        self._listed, self.n_lists = True, self.n_lists + 1
 
     # ---- how long a step may be -----------------------------------------------------------------------------------
 
@@ -310,10 +324,10 @@ class SphFluid(FluidField):
 
     def stock(self) -> Stock:
         """Return this rank's share of momentum and energy."""
-        swarm, mine = self.swarm, self.swarm.owned
-        m, v = swarm["m"][mine], swarm["v"][mine]
-        kinetic = 0.5 * float(m @ np.sum(v**2, axis=1))
-        return Stock(m @ v, kinetic, float(m @ self.law.elastic_energy(swarm["rho"][mine])))
+        swarm = self.swarm
+        m, v, mine = swarm["m"], swarm["v"], swarm.owned
+        elastic = float(m[mine] @ self.law.elastic_energy(swarm["rho"][mine]))
+        return Stock(moves.momentum(m, v, mine), moves.kinetic(m, v, mine), elastic)
 
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted.
