@@ -15,6 +15,7 @@ is what the process holds more for each of its particles than before it had any.
 from __future__ import annotations
 
 import cProfile
+import ctypes
 import gc
 import os
 import pstats
@@ -64,10 +65,6 @@ def run(case: Case) -> Report:
         measure(case.comm, name, 1000, 2)  # so that everything is compiled
         for n in QUICK_SIZES if case.quick else SIZES:
             report.rows.append(measure(case.comm, name, n))
-        if case.comm.size > 1:
-            n = (QUICK_SIZES if case.quick else SIZES[1:])[0]
-            alone = measure(MPI.COMM_SELF, name, n) if case.comm.rank == 0 else None
-            report.rows.append(case.comm.bcast(alone))
     for before, after in zip(report.rows[:-1], report.rows[1:], strict=True):
         if before["case"] == after["case"] and GROWTH_FROM <= before["particles"] < after["particles"]:
             growth = before["steps/s"] / after["steps/s"]
@@ -134,8 +131,11 @@ def _pairs(sim: Simulation) -> float:
 
 
 def _memory() -> int:
-    """Return the bytes that this process holds; 0 where the system does not tell."""
+    """Return the bytes that this process holds, without those that are free; 0 where the system does not tell."""
     gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
+    if trim is not None:
+        trim(0)
     told = Path("/proc/self/statm")
     return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0
 

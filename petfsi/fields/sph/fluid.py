@@ -176,12 +176,11 @@ class SphFluid(FluidField):
 
     def _condense(self, time: float, dt: float) -> None:
         """Take the density to the end of the step. Collective."""
-        swarm, mine = self.swarm, self.swarm.owned
+        swarm = self.swarm
         self._weigh(time)
         rates = self.passes.density_rates(self._rows(), self.pairs, *(walls.met for walls in self._sets()))
-        rho = swarm["rho"][mine]
-        power = swarm["m"][mine] * self.law.pressure(rho) / rho**2 @ rates.diffusive[mine]
-        self._diffused -= dt * float(power)
+        p = self.law.pressure(swarm["rho"])
+        self._diffused -= dt * moves.compression(swarm["m"], p, swarm["rho"], rates.diffusive, swarm.owned)
         swarm["rho"] += dt * rates.total
 
     def assemble(self, time: float, dt: float) -> None:
@@ -326,7 +325,7 @@ class SphFluid(FluidField):
         """Return this rank's share of momentum and energy."""
         swarm = self.swarm
         m, v, mine = swarm["m"], swarm["v"], swarm.owned
-        elastic = float(m[mine] @ self.law.elastic_energy(swarm["rho"][mine]))
+        elastic = moves.total(m, self.law.elastic_energy(swarm["rho"]), mine)
         return Stock(moves.momentum(m, v, mine), moves.kinetic(m, v, mine), elastic)
 
     def work(self, dt: float) -> Work:

@@ -118,6 +118,26 @@ def kinetic(m: np.ndarray, v: np.ndarray, owned: np.ndarray) -> float:
 
 
 @njit(cache=True)
+def total(m: np.ndarray, e: np.ndarray, owned: np.ndarray) -> float:
+    """Return the sum of m e over owned rows."""
+    found = 0.0
+    for i in range(e.size):
+        if owned[i]:
+            found += m[i] * e[i]
+    return found
+
+
+@njit(cache=True)
+def compression(m: np.ndarray, p: np.ndarray, rho: np.ndarray, rate: np.ndarray, owned: np.ndarray) -> float:
+    """Return the power that rates of density store in owned rows, the sum of m p/rho^2 rate, W."""
+    found = 0.0
+    for i in range(p.size):
+        if owned[i]:
+            found += m[i] * p[i] / (rho[i] * rho[i]) * rate[i]
+    return found
+
+
+@njit(cache=True)
 def farthest(x: np.ndarray, anchor: np.ndarray, owned: np.ndarray) -> float:
     """Return how far an owned row is from its anchor at most, m; nan if a place is not finite."""
     most = 0.0
