@@ -74,7 +74,7 @@ def test_forces_of_pairs_are_those_summed_by_hand(dim, n):
     swarm["v"], swarm["m"] = rng.normal(size=x.shape), 1 + rng.random(len(x))
     velocity, h = rng.normal(size=points.shape), 0.005
     law = SimpleNamespace(c=C, s=S)
-    fluid = SimpleNamespace(law=law, swarm=swarm, room=SimpleNamespace(reach=REACH), dim=dim)
+    fluid = SimpleNamespace(law=law, swarm=swarm, room=SimpleNamespace(reach=REACH, near=0.0), dim=dim)
     pairs = _Pairs(fluid, points, velocity, facets, h)
     on_points = pairs.push(pairs.force).reshape(points.shape)
     expected, met = np.zeros_like(points), 0

@@ -38,6 +38,9 @@ BENCHES = {
     "particles": Bench(
         "vortices, channels, still water and dams that break, against exact and measured ones", "10 min", "1 min"
     ),
+    "particle-speed": Bench(
+        "steps a second of particles in tanks in 2D and 3D, and beside a beam: phases, memory", "5 min", "1 min"
+    ),
     "solver": Bench("one solve over density ratio, stiffness, step and grid, against others", "20 min", "20 s"),
 }
 

@@ -41,7 +41,7 @@ from petfsi.couplings.base import Coupling
 from petfsi.couplings.particles import THETA
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.sph.facets import contacts
-from petfsi.fields.sph.fluid import SKIN, SphFluid
+from petfsi.fields.sph.fluid import SphFluid
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import gather_sums, gather_triplets
 from petfsi.scene import schema
@@ -188,7 +188,7 @@ class _Pairs:
 
     def __init__(self, fluid: SphFluid, points: np.ndarray, velocity: np.ndarray, facets: np.ndarray, dt: float):
         law, swarm, reach = fluid.law, fluid.swarm, fluid.room.reach
-        found = contacts(swarm, points, facets, reach, SKIN * reach)
+        found = contacts(swarm, points, facets, reach, fluid.room.near)
         self._swarm, self._row, self._normal, self.n_behind = swarm, found.row, found.normal, found.n_behind
         dim = fluid.dim
         columns = dim * facets[found.facet][:, :, None] + np.arange(dim)

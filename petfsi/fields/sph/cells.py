@@ -130,7 +130,7 @@ class PairLists:
             Support of the kernel and skin, m; not above a cell's side.
         """
         counts = np.asarray(counts, dtype=np.int64)
-        start, self._fluid, n = _FLUID_PAIRS[counts.size](_axes(x), owned, first, counts, reach**2, self._fluid)
+        start, self._fluid, n = _FLUID_PAIRS[counts.size](_axes(x), owned, first, counts, reach**2, LANES, self._fluid)
         return Pairs(start, self._fluid[:n])
 
     def wall(self, x, owned, first, x_wall, owned_wall, first_wall, counts, reach: float) -> Pairs:
@@ -139,7 +139,7 @@ class PairLists:
         Arguments as in ``fluid``, for the rows of the fluid and for those of walls, sorted into the same cells.
         """
         counts = np.asarray(counts, dtype=np.int64)
-        args = (_axes(x), owned, first, _axes(x_wall), owned_wall, first_wall, counts, reach**2, self._wall)
+        args = (_axes(x), owned, first, _axes(x_wall), owned_wall, first_wall, counts, reach**2, LANES, self._wall)
         start, self._wall, n = _WALL_PAIRS[counts.size](*args)
         return Pairs(start, self._wall[:n])
 
@@ -247,32 +247,70 @@ def _locate(cell, counts, c, dim):
         c = c // counts[axis]
 
 
-@njit(cache=True, inline="always")
-def _append_near(other, n, x, y, z, begin, end, x0, y0, z0, reach2, mine, owned, hit, flat):
-    """Append the rows from ``begin`` to ``end`` that are near the point; return the new number of entries.
+#: Candidates stand in blocks of eight; an argument, because of a loop with a known end LLVM makes copies, not vectors.
+LANES = np.uint64(8)
 
-    The first loop, over contiguous rows, is one for the processor's vectors; the last writes each row and
-    moves the count on only if it was hit, without a branch to guess wrong.
-    """
-    if begin >= end:
-        return n
-    begin, end = np.uint64(begin), np.uint64(end)
-    hit = hit[: end - begin]
-    xs, ys, zs = x[begin:end], y[begin:end], z[begin:end]
-    for j in range(hit.size):
-        r0, r1 = x0 - xs[j], y0 - ys[j]
-        r2 = r0 * r0 + r1 * r1
-        if not flat:
-            r = z0 - zs[j]
-            r2 += r * r
-        hit[j] = r2 < reach2
-    if not mine:
-        for j in range(hit.size):
-            hit[j] &= owned[begin + np.uint64(j)]
-    for j in range(hit.size):
-        other[np.uint64(n)] = begin + np.uint64(j)
-        n += np.int64(hit[j])
+
+@njit(cache=True)
+def _box(axes, begin, end, box):
+    """Write the lowest and highest coordinates of these rows."""
+    for axis in range(axes.shape[0]):
+        low = high = axes[axis, begin]
+        for i in range(begin + 1, end):
+            low, high = min(low, axes[axis, i]), max(high, axes[axis, i])
+        box[axis, 0], box[axis, 1] = low, high
+
+
+@njit(cache=True)
+def _candidates(dim, n):
+    """Return memory for n candidates and more: their places and distances in blocks, all finite, and their rows."""
+    n_blocks = n // 4 + 2
+    return np.zeros((dim, n_blocks, 8)), np.zeros((n_blocks, 8)), np.empty(8 * n_blocks, dtype=np.uint32)
+
+
+@njit(cache=True, error_model="numpy")
+def _collect(axes, begin, end, box, reach2, blocks, rows, n):
+    """Append to the blocks the places of rows from ``begin`` to ``end`` nearer to a box than the reach; count them."""
+    dim = axes.shape[0]
+    for j in range(np.uint64(begin), np.uint64(end)):
+        far2 = 0.0
+        block, lane = n >> np.uint64(3), n & np.uint64(7)
+        for axis in range(dim):
+            x = axes[axis, j]
+            blocks[axis, block, lane] = x
+            far = max(max(box[axis, 0] - x, x - box[axis, 1]), 0.0)
+            far2 += far * far
+        rows[n] = j
+        n += np.uint64(far2 < reach2)
     return n
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _append_near(other, n, blocks, rows, begin, end, x, y, z, reach2, mine, owned, lanes, far2, flat):
+    """Append the candidates from ``begin`` to ``end`` that are near the point; return the new number of entries.
+
+    The first loop, over whole blocks, is one for the processor's vectors; the last writes each row and moves the count
+    on only if it is near, without a branch to guess wrong.
+    """
+    for block in range(begin >> np.uint64(3), (end + np.uint64(7)) >> np.uint64(3)):
+        for lane in range(lanes):
+            r0, r1 = x - blocks[0, block, lane], y - blocks[1, block, lane]
+            r2 = r0 * r0 + r1 * r1
+            if not flat:
+                r = z - blocks[2, block, lane]
+                r2 += r * r
+            far2[block, lane] = r2
+    n = np.uint64(n)
+    if mine:
+        for k in range(begin, end):
+            other[n] = rows[k]
+            n += np.uint64(far2[k >> np.uint64(3), k & np.uint64(7)] < reach2)
+    else:
+        for k in range(begin, end):
+            j = rows[k]
+            other[n] = j
+            n += np.uint64(owned[j] & (far2[k >> np.uint64(3), k & np.uint64(7)] < reach2))
+    return np.int64(n)
 
 
 def _compile_fluid_pairs(dim):
@@ -280,12 +318,11 @@ def _compile_fluid_pairs(dim):
     runs, flat = 2 if dim == 2 else 5, dim == 2
 
     @njit(cache=True)
-    def fluid(axes, owned, first, counts, reach2, other):
-        x, y, z = axes[0], axes[1], axes[dim - 1]
-        start = np.zeros(x.size + 1, dtype=np.int64)
+    def fluid(axes, owned, first, counts, reach2, lanes, other):
+        start = np.zeros(owned.size + 1, dtype=np.int64)
         begin, end = np.empty(runs, dtype=np.int64), np.empty(runs, dtype=np.int64)
-        cell = np.empty(dim, dtype=np.int64)
-        hit = np.empty(0, dtype=np.uint8)
+        cell, box = np.empty(dim, dtype=np.int64), np.empty((dim, 2))
+        blocks, far2, rows = _candidates(dim, 0)
         n = 0
         for c in range(first.size - 1):
             if first[c] == first[c + 1]:
@@ -297,14 +334,19 @@ def _compile_fluid_pairs(dim):
                 begin[run], end[run] = line_of_cells(first, counts, cell, a, b, dim)
             begin[0] = first[c]
             most = np.sum(end - begin)
-            if hit.size < most:
-                hit = np.empty(2 * most, dtype=np.uint8)
-            for i in range(first[c], first[c + 1]):
-                begin[0] = i + 1
-                other = _grown(other, n, n + most)
-                for run in range(runs):
-                    b, e = begin[run], end[run]
-                    n = _append_near(other, n, x, y, z, b, e, x[i], y[i], z[i], reach2, owned[i], owned, hit, flat)
+            if rows.size <= most:
+                blocks, far2, rows = _candidates(dim, most)
+            _box(axes, first[c], first[c + 1], box)
+            found = np.uint64(0)
+            for run in range(runs):
+                found = _collect(axes, begin[run], end[run], box, reach2, blocks, rows, found)
+            other = _grown(other, n, n + np.int64(found) * (first[c + 1] - first[c]) + 1)
+            for k in range(first[c + 1] - first[c]):
+                i = first[c] + k
+                x, y, z = axes[0, i], axes[1, i], axes[dim - 1, i]
+                n = _append_near(
+                    other, n, blocks, rows, np.uint64(k + 1), found, x, y, z, reach2, owned[i], owned, lanes, far2, flat
+                )
                 start[i + 1] = n
         return start, other, n
 
@@ -316,13 +358,11 @@ def _compile_wall_pairs(dim):
     runs, flat = 3 if dim == 2 else 9, dim == 2
 
     @njit(cache=True)
-    def wall(axes, owned, first, axes_wall, owned_wall, first_wall, counts, reach2, other):
-        x, y, z = axes[0], axes[1], axes[dim - 1]
-        xd, yd, zd = axes_wall[0], axes_wall[1], axes_wall[dim - 1]
-        start = np.zeros(x.size + 1, dtype=np.int64)
+    def wall(axes, owned, first, axes_wall, owned_wall, first_wall, counts, reach2, lanes, other):
+        start = np.zeros(owned.size + 1, dtype=np.int64)
         begin, end = np.empty(runs, dtype=np.int64), np.empty(runs, dtype=np.int64)
-        cell = np.empty(dim, dtype=np.int64)
-        hit = np.empty(0, dtype=np.uint8)
+        cell, box = np.empty(dim, dtype=np.int64), np.empty((dim, 2))
+        blocks, far2, rows = _candidates(dim, 0)
         n = 0
         for c in range(first.size - 1):
             if first[c] == first[c + 1]:
@@ -331,17 +371,21 @@ def _compile_wall_pairs(dim):
             for run in range(runs):
                 a, b = (run - 1, 0) if dim == 2 else (run // 3 - 1, run % 3 - 1)
                 begin[run], end[run] = line_of_cells(first_wall, counts, cell, a, b, dim)
-            most = np.sum(end - begin)
-            if hit.size < most:
-                hit = np.empty(2 * most, dtype=np.uint8)
+            most, found = np.sum(end - begin), np.uint64(0)
+            if most > 0:
+                if rows.size <= most:
+                    blocks, far2, rows = _candidates(dim, most)
+                _box(axes, first[c], first[c + 1], box)
+                for run in range(runs):
+                    found = _collect(axes_wall, begin[run], end[run], box, reach2, blocks, rows, found)
+                other = _grown(other, n, n + np.int64(found) * (first[c + 1] - first[c]) + 1)
             for i in range(first[c], first[c + 1]):
-                if most > 0:
-                    other = _grown(other, n, n + most)
-                    for run in range(runs):
-                        b, e = begin[run], end[run]
-                        n = _append_near(
-                            other, n, xd, yd, zd, b, e, x[i], y[i], z[i], reach2, owned[i], owned_wall, hit, flat
-                        )
+                if found > 0:
+                    x, y, z = axes[0, i], axes[1, i], axes[dim - 1, i]
+                    n = _append_near(
+                        other, n, blocks, rows, np.uint64(0), found, x, y, z, reach2, owned[i], owned_wall, lanes, far2,
+                        flat,
+                    )  # fmt: skip
                 start[i + 1] = n
         return start, other, n
 

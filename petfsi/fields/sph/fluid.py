@@ -38,8 +38,6 @@ from petfsi.geometry.bodies import enclosed
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
-#: Lists of pairs reach so much farther than particles see: they hold while no two came nearer by as much.
-SKIN = 0.05
 #: Particles that went through a thin body are put back so far before it, in spacings; if more than a few, and more than
 #: one in so many of all, did in one step, the run stops.
 GAP, FEW, MOST = 0.1, 10, 1000
@@ -92,10 +90,12 @@ class SphFluid(FluidField):
     def __init__(self, comm: MPI.Comm, scene: Scene):
         start = Start(scene)
         self.comm, self.scene, self.dim = comm, scene, scene.dim
-        self.law, self.room = start.law, Room.of(scene, start.law, SKIN)
+        self.law, self.room = start.law, Room.of(scene, start.law)
         self.density, self.spacing = start.law.rho0, start.law.spacing
         self.cell_volume = self.spacing**self.dim
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
+        constant = not any(g.depends_on_time for g in self._gravity)
+        self._constant_gravity = self._gravity_at(0.0) if constant else None
         self.passes, self._lists = Passes(start.explicit_law), PairLists()
         vector, number = (self.dim, np.float64), ((), np.float64)
         columns: dict[str, tuple[int | tuple[()], type]] = {"v": vector, "rho": number, "m": number}
@@ -112,7 +112,7 @@ class SphFluid(FluidField):
         self.walls = Walls(comm, self.room.grid, boxes, dummies, start.plates) if len(dummies.x) else None
         self.skin: Skin | None = None
         self.sight: Sight | None = None
-        self.n_put_back = 0
+        self.n_put_back = self.n_lists = 0
         self.kept: dict[str, np.ndarray] = dict(self.openings.kept)
         self.tallied: dict[str, float] = {}
         self._notes, self._taken = start.notes, dummies.x
@@ -138,7 +138,7 @@ class SphFluid(FluidField):
         Particles in thin bodies, or next to nothing before a surface, are taken out. Collective.
         """
         self.clear(points, facets)
-        reach = (1 + SKIN) * self.room.reach
+        reach = self.room.reach + self.room.near
         thin, part = thin_shells(points, facets, THIN * self.spacing)
         if part > PARTLY:
             self._notes.append(
@@ -178,6 +178,9 @@ class SphFluid(FluidField):
 
     def gravity(self, t: float) -> np.ndarray:
         """Return the acceleration of gravity at a time, shape (dim,), m/s^2."""
+        return self._gravity_at(t) if self._constant_gravity is None else self._constant_gravity
+
+    def _gravity_at(self, t: float) -> np.ndarray:
         return np.array([float(g(t=t)) for g in self._gravity]) if self._gravity else np.zeros(self.dim)
 
     # ---- the step -------------------------------------------------------------------------------------------------
@@ -198,10 +201,9 @@ class SphFluid(FluidField):
         self._condense(time + half, dt)
         moves.drift(swarm["x"], swarm["v"], half)
         self.openings.drift(half)
-        mine = swarm.owned
-        self._way += dt * (swarm["m"][mine] @ swarm["v"][mine])
+        self._way += dt * moves.momentum(swarm["m"], swarm["v"], swarm.owned)
         if self.room.shifting:
-            columns = swarm["x"], swarm["v"], swarm["S"], swarm["m"], mine
+            columns = swarm["x"], swarm["v"], swarm["S"], swarm["m"], swarm.owned
             shifted = np.zeros(self.dim)
             moves.shift(*columns, dt, self.law.s, moves.SLOW * self.law.c, shifted)
             self._diffused += float(shifted @ self.gravity(time + half))
@@ -209,14 +211,13 @@ class SphFluid(FluidField):
 
     def _condense(self, time: float, dt: float) -> None:
         """Take the density to the end of the step. Collective."""
-        swarm, mine = self.swarm, self.swarm.owned
+        swarm = self.swarm
         self._weigh(time)
         if self.skin is not None:
             self.skin.look(self.swarm["x"])
         rates = self.passes.density_rates(self._rows(), self.pairs, *(walls.met for walls in self._sets()))
-        rho = swarm["rho"][mine]
-        power = swarm["m"][mine] * self.law.pressure(rho) / rho**2 @ rates.diffusive[mine]
-        self._diffused -= dt * float(power)
+        p = self.law.pressure(swarm["rho"])
+        self._diffused -= dt * moves.compression(swarm["m"], p, swarm["rho"], rates.diffusive, swarm.owned)
         self.openings.hold(swarm, rates.total, dt)
         swarm["rho"] += dt * rates.total
 
@@ -261,12 +262,11 @@ class SphFluid(FluidField):
         forces = self.passes.forces(fluid, p, self.pairs, *(walls.met for walls in sets))
         for walls, force in zip(sets, forces.f_walls, strict=True):
             walls.take(force)
-        mine = self.swarm.owned
-        self._dissipated = dt * float(forces.dissipated[mine].sum())
-        self.swarm["S"] = moves.fade(forces.S, forces.full)
+        self._dissipated = dt * float(forces.dissipated[self.swarm.owned].sum())
+        moves.fade(forces.S, forces.full, self.swarm["S"])
         if self.viscous is not None:
             self.viscous.weigh(self.swarm, self.law, self.pairs, [walls.met for walls in sets], self._half(dt))
-        self.swarm["a"] = forces.f / fluid.m[:, None] + self.gravity(end)
+        moves.accelerate(forces.f, fluid.m, self.gravity(end), self.swarm["a"])
         self.openings.lead(self.swarm, self.gravity(end), end, dt)
         if not self._moving:
             self.openings.take_lost()  # nothing is done outside of steps
@@ -324,25 +324,38 @@ class SphFluid(FluidField):
             self.law, self.passes.law = replace(self.law, gravity=g), replace(self.passes.law, gravity=g)
 
     def _refresh(self, *names: str) -> None:
-        """Give ghosts these columns anew; list pairs again if particles have come too near each other. Collective.
+        """Give ghosts these columns, x among them, anew; list pairs again where a list does not hold. Collective.
 
         Raises
         ------
         SolveError
             On all ranks, where a particle is nowhere, or where none can be.
         """
-        swarm = self.swarm
+        swarm, room = self.swarm, self.room
         way = moves.farthest(swarm["x"], swarm["anchor"], swarm.owned) if self._listed else np.inf
         way = max([np.inf if np.isnan(way) else way, *(walls.farthest() for walls in self._sets())])
         way = self.comm.allreduce(way, MPI.MAX)
-        if 2 * way < SKIN * self.room.reach:
+        if way < max(room.near / 2, room.wide):
             swarm.exchange(*names)
-        else:
+        if not (2 * way < room.near or (way < room.wide and self._stays_together())):
             self._list_pairs()
+
+    def _stays_together(self) -> bool:
+        """Whether particles go so much the same way that none came near that is not listed. Collective.
+
+        Those two cells apart or less are compared. Others stay apart, as none has gone farther than cells are wider
+        than particles see.
+        """
+        swarm = self.swarm
+        # what solids hide, and where they meet particles, changes as these pass by; columns feed in at every list
+        if len(self.scene.solids) or self.openings.inlets:
+            return False
+        spread = moves.spread(swarm["x"], swarm["anchor"], swarm.first, swarm.counts)
+        return self.comm.allreduce(spread, MPI.MAX) < self.room.near
 
     def _list_pairs(self) -> None:
         """Sort the particles and list their pairs. Collective."""
-        swarm, reach = self.swarm, (1 + SKIN) * self.room.reach
+        swarm, reach = self.swarm, self.room.reach + self.room.near
         self.openings.exchange(swarm)
         self.room.check(self.comm, swarm)
         try:
@@ -357,8 +370,8 @@ class SphFluid(FluidField):
             self.sight.place(self.skin.points, swarm["x"])
             self.pairs = self.sight.strike(self.pairs, swarm["x"])
         for walls in self._sets():
-            walls.meet(swarm, reach)
-        self._listed = True
+            walls.meet(swarm, self.room.reach + self.room.wide)
+        self._listed, self.n_lists = True, self.n_lists + 1
 
     def _sunk(self) -> np.ndarray:
         """Return which points of the surface are a spacing or more inside of walls, or beyond."""
@@ -421,10 +434,10 @@ class SphFluid(FluidField):
 
     def stock(self) -> Stock:
         """Return this rank's share of momentum and energy."""
-        swarm, mine = self.swarm, self.swarm.owned
-        m, v = swarm["m"][mine], swarm["v"][mine]
-        kinetic = 0.5 * float(m @ np.sum(v**2, axis=1))
-        return Stock(m @ v, kinetic, float(m @ self.law.elastic_energy(swarm["rho"][mine])))
+        swarm = self.swarm
+        m, v, mine = swarm["m"], swarm["v"], swarm.owned
+        elastic = moves.total(m, self.law.elastic_energy(swarm["rho"]), mine)
+        return Stock(moves.momentum(m, v, mine), moves.kinetic(m, v, mine), elastic)
 
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done in the step last accepted.

@@ -73,12 +73,68 @@ def shift(x, v, sums, m, owned, h, s, slow, way):
                 way[axis] += m[i] * d
 
 
-def fade(sums: np.ndarray, full: np.ndarray) -> np.ndarray:
-    """Return S (n, dim) without what would spread a free surface, or spray: these have room on one side or all around.
+@njit(cache=True)
+def fade(sums: np.ndarray, full: np.ndarray, faded: np.ndarray) -> None:
+    """Write S (n, dim) without what would spread a free surface, or spray: these have room on one side or all around.
 
     A switch at the surface alone, as by |S|, lets jets swell to several times their volume.
     """
-    return sums * np.clip((full - EMPTY) / (FULL - EMPTY), 0.0, 1.0)[:, None]
+    for i in range(sums.shape[0]):
+        part = min(max((full[i] - EMPTY) / (FULL - EMPTY), 0.0), 1.0)
+        for axis in range(sums.shape[1]):
+            faded[i, axis] = sums[i, axis] * part
+
+
+@njit(cache=True)
+def accelerate(f: np.ndarray, m: np.ndarray, g: np.ndarray, a: np.ndarray) -> None:
+    """Write a = f/m + g (n, dim)."""
+    for i in range(f.shape[0]):
+        for axis in range(f.shape[1]):
+            a[i, axis] = f[i, axis] / m[i] + g[axis]
+
+
+@njit(cache=True)
+def momentum(m: np.ndarray, v: np.ndarray, owned: np.ndarray) -> np.ndarray:
+    """Return the sum of m v over owned rows, shape (dim,)."""
+    total = np.zeros(v.shape[1])
+    for i in range(v.shape[0]):
+        if owned[i]:
+            for axis in range(v.shape[1]):
+                total[axis] += m[i] * v[i, axis]
+    return total
+
+
+@njit(cache=True)
+def kinetic(m: np.ndarray, v: np.ndarray, owned: np.ndarray) -> float:
+    """Return the sum of m v^2 / 2 over owned rows."""
+    total = 0.0
+    for i in range(v.shape[0]):
+        if owned[i]:
+            v2 = 0.0
+            for axis in range(v.shape[1]):
+                v2 += v[i, axis] * v[i, axis]
+            total += 0.5 * m[i] * v2
+    return total
+
+
+@njit(cache=True)
+def total(m: np.ndarray, e: np.ndarray, owned: np.ndarray) -> float:
+    """Return the sum of m e over owned rows."""
+    found = 0.0
+    for i in range(e.size):
+        if owned[i]:
+            found += m[i] * e[i]
+    return found
+
+
+@njit(cache=True)
+def compression(m: np.ndarray, p: np.ndarray, rho: np.ndarray, rate: np.ndarray, owned: np.ndarray) -> float:
+    """Return the power that rates of density store in owned rows, the sum of m p/rho^2 rate, W."""
+    found = 0.0
+    for i in range(p.size):
+        if owned[i]:
+            found += m[i] * p[i] / (rho[i] * rho[i]) * rate[i]
+    return found
 
 
 @njit(cache=True)
@@ -112,3 +168,56 @@ def fastest(v: np.ndarray, owned: np.ndarray) -> float:
                 if not np.isfinite(v2):
                     return np.nan
     return np.sqrt(most)
+
+
+@njit(cache=True)
+def spread(x: np.ndarray, anchor: np.ndarray, first: np.ndarray, counts: np.ndarray) -> float:
+    """Return how much the ways of two rows at most two cells apart differ at most, or a little more, m.
+
+    That is the largest diagonal of a box that holds the ways of all rows in a cell and those around it. Cells of the
+    halo are not at the middle: those are other ranks' own.
+
+    Parameters
+    ----------
+    x, anchor : ndarray, shape (n, dim)
+        Places of sorted rows now, and when they were sorted, m.
+    first : ndarray of int64, shape (n_cells + 1,)
+    counts : ndarray of int, shape (dim,)
+        See ``Swarm``.
+    """
+    dim, n_cells = x.shape[1], first.size - 1
+    low, high = np.full((n_cells, dim), np.inf), np.full((n_cells, dim), -np.inf)
+    for c in range(n_cells):
+        for i in range(first[c], first[c + 1]):
+            for axis in range(dim):
+                way = x[i, axis] - anchor[i, axis]
+                low[c, axis], high[c, axis] = min(low[c, axis], way), max(high[c, axis], way)
+    stride = 1
+    for axis in range(dim - 1, -1, -1):
+        _widen(low, high, stride)
+        stride *= counts[axis]
+    most = 0.0
+    for c in range(n_cells):
+        rest, size2, inner = c, 0.0, True
+        for axis in range(dim - 1, -1, -1):
+            rest, k = rest // counts[axis], rest % counts[axis]
+            inner &= 0 < k < counts[axis] - 1
+            size2 += max(high[c, axis] - low[c, axis], 0.0) ** 2
+        if inner:
+            most = max(most, size2)
+    return np.sqrt(most)
+
+
+@njit(cache=True)
+def _widen(low, high, stride):
+    """Let each box hold those so many places before and after it as well."""
+    n, dim = low.shape
+    for axis in range(dim):
+        for begin in range(min(stride, n)):
+            low_before, high_before = np.inf, -np.inf
+            for c in range(begin, n, stride):
+                low_here, high_here = low[c, axis], high[c, axis]
+                after = c + stride if c + stride < n else c
+                low[c, axis] = min(min(low_before, low_here), low[after, axis])
+                high[c, axis] = max(max(high_before, high_here), high[after, axis])
+                low_before, high_before = low_here, high_here

@@ -20,6 +20,10 @@ from petfsi.scene.shape_checks import OPPOSITE
 
 #: The grid of cells goes so many reaches beyond the box: wall particles and those that leave must have a cell.
 MARGIN = 2.0
+#: Lists of pairs of particles reach so much farther than particles see, over that; cells, and lists of pairs with
+#: walls, so much, by dimension: they last longer if that is more, and cost more. Beside solids, where a list holds only
+#: while no particle has gone far, and where a period has no room for more, all are ``NARROW``.
+NEAR, WIDE, NARROW = 0.1, {2: 0.25, 3: 0.1}, 0.05
 
 
 @dataclass
@@ -33,8 +37,8 @@ class Room:
     sides : list of pairs of str or InflowSide
         What it has along each axis.
     grid : CellGrid
-    reach : float
-        How far particles see, m.
+    reach, near, wide : float
+        How far particles see, and how much farther lists of pairs reach: of particles, and of these with walls, m.
     spacing : float
         m.
     shifting : bool
@@ -45,11 +49,13 @@ class Room:
     sides: list[tuple[str | InflowSide, str | InflowSide]]
     grid: CellGrid
     reach: float
+    near: float
+    wide: float
     spacing: float
     shifting: bool
 
     @classmethod
-    def of(cls, scene: Scene, law: Law, skin: float) -> Room:
+    def of(cls, scene: Scene, law: Law) -> Room:
         """Return the room of a scene."""
         fluid = scene.fluid
         assert isinstance(fluid, fluids.SphFluid)
@@ -60,8 +66,12 @@ class Room:
         periodic = np.array([pair == ("periodic", "periodic") for pair in sides])
         reach = 2.0 * law.s
         margin = np.where(periodic, 0.0, MARGIN * reach)
-        grid = cell_grid(low - margin, high + margin, (1 + skin) * reach, periodic)
-        return cls(low, high, sides, grid, reach, fluid.spacing, fluid.shifting)
+        wide = WIDE[scene.dim] * reach
+        fits = not np.any((high - low)[periodic] < reach + wide)
+        settled = not scene.solids and not any(isinstance(side, InflowSide) for pair in sides for side in pair)
+        near, wide = (NEAR * reach, wide) if fits and settled else (NARROW * reach, NARROW * reach)
+        grid = cell_grid(low - margin, high + margin, reach + wide, periodic)
+        return cls(low, high, sides, grid, reach, near, wide, fluid.spacing, fluid.shifting)
 
     @property
     def is_open(self) -> bool:
