@@ -16,40 +16,26 @@ from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
-from scipy.spatial import cKDTree
 
 from petfsi.errors import SolveError
 from petfsi.fields.base import FluidField, Reader, Slab, Stock, Work
 from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.fields.sph import moves, probes
 from petfsi.fields.sph.balance import bisect
+from petfsi.fields.sph.bodies import Bodies
 from petfsi.fields.sph.cells import PairLists, Pairs
 from petfsi.fields.sph.openings import Openings
+from petfsi.fields.sph.pace import Pace
 from petfsi.fields.sph.particles import StrayError, Swarm
 from petfsi.fields.sph.passes import FluidRows, Passes
 from petfsi.fields.sph.room import Room
-from petfsi.fields.sph.sight import Sight
 from petfsi.fields.sph.skin import Skin
-from petfsi.fields.sph.start import Start, depth_behind, limits
-from petfsi.fields.sph.thin import thin_shells, wet_on_both_sides
+from petfsi.fields.sph.start import Start
 from petfsi.fields.sph.viscosity import THETA, ImplicitViscosity
 from petfsi.fields.sph.walls import Walls
-from petfsi.geometry.bodies import enclosed
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
-#: Particles that went through a thin body are put back so far before it, in spacings; if more than a few, and more than
-#: one in so many of all, did in one step, the run stops.
-GAP, FEW, MOST = 0.1, 10, 1000
-#: Particles begin so far, in spacings, before solids.
-CLEARANCE = 0.25
-#: Bodies thinner than so many spacings for the most part hide one side from the other, and have two sets of wall
-#: particles; if so large a part of the others' surface is as thin, that is told.
-THIN, PARTLY = 1.75, 0.3
-#: A point nearer than so many spacings to a wall particle that is a spacing or more inside is there, too.
-SUNK = 0.6
-#: Speeds above this part of that of sound, and densities off by more than this part, are remarked on.
-FAST, DENSE = 0.2, 0.05
 #: What a checkpoint holds besides "id" and "x".
 STORED = ("v", "rho", "m", "a", "S")
 
@@ -66,10 +52,8 @@ class SphFluid(FluidField):
         With the law.
     walls : Walls or None
         Those at rest; None where no side and no obstacle holds the fluid.
-    skin : Skin or None
-        Those of solids, if a coupling has put any in.
-    sight : Sight or None
-        What bodies thinner than particles see hide.
+    bodies : Bodies
+        The surfaces of solids, if a coupling has put any in.
     kept, tallied : dict
         What a coupling wants to find again after a restart, arrays that every rank has; and to say in history.csv.
     pairs : Pairs
@@ -110,20 +94,17 @@ class SphFluid(FluidField):
         self.openings = Openings(comm, self.room, self.law, start.inlets, len(start.x), start.waiting)
         dummies = start.dummies()
         self.walls = Walls(comm, self.room.grid, boxes, dummies, start.plates) if len(dummies.x) else None
-        self.skin: Skin | None = None
-        self.sight: Sight | None = None
-        self.n_put_back = self.n_lists = 0
+        self.bodies, self._pace = Bodies(comm, self.room, dummies, self.law.nu > 0), Pace()
+        self.n_lists = 0
         self.kept: dict[str, np.ndarray] = dict(self.openings.kept)
         self.tallied: dict[str, float] = {}
-        self._notes, self._taken = start.notes, dummies.x
-        self._deep = cKDTree(dummies.x[dummies.depth > self.spacing])
+        self.bodies.notes = start.notes
         self.viscous: ImplicitViscosity | None = None
         if start.implicit:
             self.viscous = ImplicitViscosity(comm, self.swarm, THETA.get(scene.time.integrator, 1.0))
             self.has_block = True
             self._take_block()
         self.swarm["a"][:] = self.gravity(0.0)
-        self._warned = False
         self._forget_step()
         self._measure_speeds()
 
@@ -138,35 +119,17 @@ class SphFluid(FluidField):
         Particles in thin bodies, or next to nothing before a surface, are taken out. Collective.
         """
         self.clear(points, facets)
-        reach = self.room.reach + self.room.near
-        thin, part = thin_shells(points, facets, THIN * self.spacing)
-        if part > PARTLY:
-            self._notes.append(
-                f"{100 * part:.2g}% of the solids' surface is of parts thinner than {THIN * self.spacing:g} m: water "
-                "on both sides of these feels that on the other; a smaller fluid.spacing may help"
-            )
-        about = thin, self.law.nu > 0, self._taken
-        self.skin = Skin(self.comm, self.room.grid, self.spacing, self.room.reach, points, facets, *about)
-        if np.any(thin):
-            both = wet_on_both_sides(points, facets, reach)
-            self.sight = Sight(facets, thin, reach, both, self.room.grid)
-        self._rooted = self._sunk()
-        self._listed = False
-        return self.skin
+        return self.bodies.immerse(points, facets)
 
     def clear(self, points: np.ndarray, facets: np.ndarray) -> None:
         """Take particles out that are inside of a surface, or next to nothing before it, and tell. Collective."""
-        near = CLEARANCE * self.spacing
-        depth = depth_behind(self.swarm["x"], points, facets, self.room.reach)
-        inside = self.swarm.owned & (depth > -near)
-        far = np.flatnonzero(self.swarm.owned & np.isneginf(depth))
-        inside[far] = enclosed(points, facets, self.swarm["x"][far])
-        dropped = self.comm.allreduce(int(np.count_nonzero(inside)))
-        if dropped:
-            self.swarm.remove(inside)
-            self.swarm.rebuild()
-            self._notes.append(f"fluid.fill: {dropped} places lie in solids, or less than {near:g} m before them")
+        self.bodies.clear(self.swarm, points, facets)
         self._listed = False
+
+    @property
+    def skin(self) -> Skin | None:
+        """The wall particles of solids, if a coupling has put any in."""
+        return self.bodies.skin
 
     @property
     def is_moving(self) -> bool:
@@ -189,8 +152,7 @@ class SphFluid(FluidField):
         """Kick, drift, take the new density, drift, shift: all but the forces at the end. Collective."""
         swarm, half = self.swarm, dt / 2
         self._way, self._diffused, self._pushed, self._moving = np.zeros(self.dim), 0.0, False, True
-        if self.sight is not None and self.skin is not None:
-            swarm["origin"], self._begin = swarm["x"], self.skin.points
+        self.bodies.begin(swarm)
         moves.kick(swarm["v"], swarm["a"], half)
         moves.drift(swarm["x"], swarm["v"], half)
         self.openings.drift(half)
@@ -249,7 +211,7 @@ class SphFluid(FluidField):
             return
         end = time + dt if self._moving else time
         if self._moving:
-            self._guard(dt)
+            self.bodies.guard(self.swarm, dt)
         self._refresh("x", "rho")
         self._weigh(end)
         fluid, sets = self._rows(), self._sets()
@@ -271,33 +233,6 @@ class SphFluid(FluidField):
         if not self._moving:
             self.openings.take_lost()  # nothing is done outside of steps
         self._pushed = True
-
-    def _guard(self, dt: float) -> None:
-        """Put back what has gone through a thin body in the step. Collective.
-
-        Raises
-        ------
-        SolveError
-            On all ranks, if that is more than one in ``MOST`` of all particles.
-        """
-        if self.sight is None or self.skin is None:
-            return
-        swarm, size = self.swarm, self.room.high - self.room.low
-        way = swarm["x"] - swarm["origin"]
-        before = swarm["x"] - (way - self.room.grid.periodic * np.round(way / size) * size)
-        points = self._begin, self.skin.points
-        gap = GAP * self.spacing
-        found = self.sight.crossed(before, swarm["x"], swarm["v"], *points, dt, gap, swarm.owned)
-        number, most = self.comm.allreduce(len(found.rows)), self.comm.allreduce(swarm.n_owned) / MOST
-        if number > max(FEW, most):
-            raise SolveError(
-                f"{number} particles went through thin bodies in a step, more than 1 in {MOST}; a shorter time.dt, a "
-                "larger fluid.sound_speed or a smaller fluid.spacing may help"
-            )
-        lost = swarm["m"][found.rows][:, None] * (swarm["v"][found.rows] - found.v)
-        swarm["x"][found.rows], swarm["v"][found.rows] = found.x, found.v
-        self.skin.knock(found.facets, found.x, lost)
-        self.n_put_back += number
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Kick for the second half of the step, by viscosity for all of it if that is solved for. Collective."""
@@ -362,73 +297,26 @@ class SphFluid(FluidField):
             swarm.rebuild(swarm.balanced())
         except StrayError as error:
             raise SolveError(f"the particles have blown up: {error}") from None
-        if self.skin is not None:
-            self._refuse_sunk()
+        self.bodies.refuse_sunk()
         swarm["anchor"][:] = swarm["x"]
-        self.pairs: Pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
-        if self.sight is not None and self.skin is not None:
-            self.sight.place(self.skin.points, swarm["x"])
-            self.pairs = self.sight.strike(self.pairs, swarm["x"])
+        pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
+        self.pairs: Pairs = self.bodies.strike(pairs, swarm["x"])
         for walls in self._sets():
             walls.meet(swarm, self.room.reach + self.room.wide)
         self._listed, self.n_lists = True, self.n_lists + 1
 
-    def _sunk(self) -> np.ndarray:
-        """Return which points of the surface are a spacing or more inside of walls, or beyond."""
-        assert self.skin is not None
-        x, room = self.skin.points, self.room
-        return room.behind_wall(x, self.spacing) | (self._deep.query(x)[0] < SUNK * self.spacing)
-
-    def _refuse_sunk(self) -> None:
-        """See that no solid has gone into a wall. Not collective; all ranks know the same.
-
-        Raises
-        ------
-        SolveError
-        """
-        assert self.skin is not None
-        sunk = np.flatnonzero(self._sunk() & ~self._rooted)
-        if len(sunk):
-            at = ", ".join(f"{c:g}" for c in self.skin.points[sunk[0]])
-            raise SolveError(
-                f"a solid has gone into a wall: a point of it is at ({at}), a spacing or more behind a side's or an "
-                "obstacle's face; solids do not feel walls"
-            )
-
     # ---- how long a step may be -----------------------------------------------------------------------------------
 
     def _measure_speeds(self) -> None:
-        """Find the largest speed and acceleration. Collective."""
-        swarm = self.swarm
-        found = np.array([*(moves.fastest(swarm[name], swarm.owned) for name in ("v", "a")), self._densest()])
-        found[np.isnan(found)] = np.inf
-        self.comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
-        self._fastest, self._strongest, self._dense = found.tolist()
-        if not np.isfinite(self._fastest + self._strongest):
-            raise SolveError(
-                "the particles have blown up: a velocity or an acceleration is not a finite number; a shorter time.dt "
-                "or a larger fluid.sound_speed may help"
-            )
-
-    def _densest(self) -> float:
-        """Return how far a density is from that at no pressure at most, over that; of this rank."""
-        rho = self.swarm["rho"][self.swarm.owned]
-        return float(np.abs(rho / self.law.rho0 - 1.0).max(initial=0.0))
+        self._pace.measure(self.comm, self.swarm, self.law)
 
     def remark(self) -> str | None:
         """Return that particles are too fast for the sound, or too dense, when they first are."""
-        slow = f"fluid.sound_speed = {self.law.c:.3g} m/s is too low for that, and more makes the water stiffer"
-        if self._fastest > FAST * self.law.c and not self._warned:
-            self._warned = True
-            return f"particles move at {self._fastest:.3g} m/s: {slow}"
-        if self._dense > DENSE and not self._warned:
-            self._warned = True
-            return f"the density of a particle is off by {100 * self._dense:.2g}%: {slow}"
-        return None
+        return self._pace.remark(self.law)
 
     def stable_step(self) -> float:
         """Return the smallest of the limits on the step, s."""
-        return min(limits(self.passes.law, self._fastest, self._strongest).values())
+        return self._pace.stable_step(self.passes.law)
 
     # ---- accounts -------------------------------------------------------------------------------------------------
 
@@ -455,11 +343,11 @@ class SphFluid(FluidField):
     @property
     def notes(self) -> list[str]:
         """What was dropped of the fill, and what of the table is unwise."""
-        return self._notes
+        return self.bodies.notes
 
     def tally(self) -> dict[str, float]:
         """Return the number of particles, what went through sides, and how many thin bodies threw back. Collective."""
-        put_back = {} if self.sight is None else {"put_back": float(self.n_put_back)}
+        put_back = {"put_back": float(self.bodies.n_put_back)} if self.bodies.hide else {}
         through = self.openings.tally(self.swarm)
         return {"particles": float(self.comm.allreduce(self.swarm.n_owned))} | through | put_back | self.tallied
 
