@@ -42,7 +42,7 @@ def test_no_pair_is_missing_while_lists_last(name, n):
         near = (cdist(swarm["x"], walls) < reach) & (swarm.owned[:, None] | owned)
         assert missing(fluid.walls.met.pairs, near) == 0
     assert 2 < fluid.n_lists < 30
-    assert moves.fastest(swarm["v"], swarm.owned) > 0.02 * fluid.law.c or WORLD.size > 1
+    assert np.linalg.norm(swarm["v"][swarm.owned], axis=1).max() > 0.02 * fluid.law.c or WORLD.size > 1
 
 
 @pytest.mark.parallel([2, 3, 4])

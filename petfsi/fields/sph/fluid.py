@@ -153,15 +153,15 @@ class SphFluid(FluidField):
         swarm, half = self.swarm, dt / 2
         self._way, self._diffused, self._pushed, self._moving = np.zeros(self.dim), 0.0, False, True
         self.bodies.begin(swarm)
-        moves.kick(swarm["v"], swarm["a"], half)
-        moves.drift(swarm["x"], swarm["v"], half)
+        moves.advance(swarm["v"], swarm["a"], half)
+        moves.advance(swarm["x"], swarm["v"], half)
         self.openings.drift(half)
         if self.skin is not None:
             self.skin.place(self.skin.points + half * self.skin.velocity, self.skin.velocity)
         self._refresh("x", "v", "rho")
         swarm = self.swarm
         self._condense(time + half, dt)
-        moves.drift(swarm["x"], swarm["v"], half)
+        moves.advance(swarm["x"], swarm["v"], half)
         self.openings.drift(half)
         self._way += dt * moves.momentum(swarm["m"], swarm["v"], swarm.owned)
         if self.room.shifting:
@@ -236,7 +236,7 @@ class SphFluid(FluidField):
 
     def accept(self, x: np.ndarray, time: float, dt: float) -> None:
         """Kick for the second half of the step, by viscosity for all of it if that is solved for. Collective."""
-        moves.kick(self.swarm["v"], self.swarm["a"], dt / 2)
+        moves.advance(self.swarm["v"], self.swarm["a"], dt / 2)
         if self.viscous is not None:
             sets = self._sets()
             forces, lost = self.viscous.kick(self.swarm, x, [(walls.met, walls.solved) for walls in sets], dt)
@@ -303,6 +303,7 @@ class SphFluid(FluidField):
         self.pairs: Pairs = self.bodies.strike(pairs, swarm["x"])
         for walls in self._sets():
             walls.meet(swarm, self.room.reach + self.room.wide)
+        self.openings.look(swarm)
         self._listed, self.n_lists = True, self.n_lists + 1
 
     # ---- how long a step may be -----------------------------------------------------------------------------------

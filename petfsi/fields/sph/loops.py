@@ -355,8 +355,9 @@ def seen_loop(dim: int, n_bounds: int):
 def pack(x, v, rho, m, rows):
     """Fill the packed rows."""
     for i in range(rho.size):
-        for a in range(x.shape[1]):
-            rows[i, X + a], rows[i, V + a] = x[i, a], v[i, a]
+        rows[i, X], rows[i, X + 1], rows[i, V], rows[i, V + 1] = x[i, 0], x[i, 1], v[i, 0], v[i, 1]
+        if x.shape[1] == 3:
+            rows[i, X + 2], rows[i, V + 2] = x[i, 2], v[i, 2]
         rows[i, VOLUME], rows[i, RHO] = m[i] / rho[i], rho[i]
 
 
@@ -365,14 +366,14 @@ def start_forces(p, rho, scaled, sums):
     """Fill p/rho^2 and clear the sums."""
     for i in range(rho.size):
         scaled[i] = p[i] / (rho[i] * rho[i])
-        for a in range(8):
-            sums[i, a] = 0.0
+        sums[i] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def unpack(sums, f, S_, power, full):
     """Copy the sums out."""
     for i in range(power.size):
-        for a in range(f.shape[1]):
-            f[i, a], S_[i, a] = sums[i, F + a], sums[i, S + a]
+        f[i, 0], f[i, 1], S_[i, 0], S_[i, 1] = sums[i, F], sums[i, F + 1], sums[i, S], sums[i, S + 1]
+        if f.shape[1] == 3:
+            f[i, 2], S_[i, 2] = sums[i, F + 2], sums[i, S + 2]
         power[i], full[i] = sums[i, POWER], sums[i, FULL] / f.shape[1]

@@ -18,19 +18,11 @@ SLOW = 0.01
 
 
 @njit(cache=True)
-def kick(v: np.ndarray, a: np.ndarray, t: float) -> None:
-    """Add t a to the velocities v (n, dim)."""
-    for i in range(v.shape[0]):
-        for axis in range(v.shape[1]):
-            v[i, axis] += t * a[i, axis]
-
-
-@njit(cache=True)
-def drift(x: np.ndarray, v: np.ndarray, t: float) -> None:
-    """Add t v to the positions x (n, dim)."""
-    for i in range(x.shape[0]):
-        for axis in range(x.shape[1]):
-            x[i, axis] += t * v[i, axis]
+def advance(x: np.ndarray, v: np.ndarray, t: float) -> None:
+    """Add t v to x, both (n, dim): positions and velocities drift, velocities and accelerations kick."""
+    flat, rates = x.reshape(-1), v.reshape(-1)
+    for i in range(flat.size):
+        flat[i] += t * rates[i]
 
 
 @njit(cache=True)
@@ -138,34 +130,38 @@ def compression(m: np.ndarray, p: np.ndarray, rho: np.ndarray, rate: np.ndarray,
 
 
 @njit(cache=True)
+def extremes(v: np.ndarray, a: np.ndarray, rho: np.ndarray, owned: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the largest squares of v and a (n, dim) and the least and largest rho of owned rows; nan if one is not."""
+    most = most_a = 0.0
+    low, high = np.inf, -np.inf
+    for i in range(rho.size):
+        if owned[i]:
+            v2 = v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1]
+            a2 = a[i, 0] * a[i, 0] + a[i, 1] * a[i, 1]
+            if v.shape[1] == 3:
+                v2, a2 = v2 + v[i, 2] * v[i, 2], a2 + a[i, 2] * a[i, 2]
+            # a sum that is not finite must stay
+            most, most_a = (most if v2 <= most else v2), (most_a if a2 <= most_a else a2)
+            if not np.isfinite(v2 + a2):
+                return np.nan, np.nan, np.nan, np.nan
+            low, high = min(low, rho[i]), max(high, rho[i])
+    return most, most_a, low, high
+
+
+@njit(cache=True)
 def farthest(x: np.ndarray, anchor: np.ndarray, owned: np.ndarray) -> float:
     """Return how far an owned row is from its anchor at most, m; nan if a place is not finite."""
     most = 0.0
     for i in range(x.shape[0]):
         if owned[i]:
-            d2 = 0.0
-            for axis in range(x.shape[1]):
-                d = x[i, axis] - anchor[i, axis]
+            d, e = x[i, 0] - anchor[i, 0], x[i, 1] - anchor[i, 1]
+            d2 = d * d + e * e
+            if x.shape[1] == 3:
+                d = x[i, 2] - anchor[i, 2]
                 d2 += d * d
             if not d2 <= most:
                 most = d2
                 if not np.isfinite(d2):
-                    return np.nan
-    return np.sqrt(most)
-
-
-@njit(cache=True)
-def fastest(v: np.ndarray, owned: np.ndarray) -> float:
-    """Return the largest length of the vectors v (n, dim) of owned rows; nan if one is not finite."""
-    most = 0.0
-    for i in range(v.shape[0]):
-        if owned[i]:
-            v2 = 0.0
-            for axis in range(v.shape[1]):
-                v2 += v[i, axis] * v[i, axis]
-            if not v2 <= most:
-                most = v2
-                if not np.isfinite(v2):
                     return np.nan
     return np.sqrt(most)
 
@@ -188,10 +184,12 @@ def spread(x: np.ndarray, anchor: np.ndarray, first: np.ndarray, counts: np.ndar
     dim, n_cells = x.shape[1], first.size - 1
     low, high = np.full((n_cells, dim), np.inf), np.full((n_cells, dim), -np.inf)
     for c in range(n_cells):
-        for i in range(first[c], first[c + 1]):
-            for axis in range(dim):
+        for axis in range(dim):
+            least, most = np.inf, -np.inf
+            for i in range(first[c], first[c + 1]):
                 way = x[i, axis] - anchor[i, axis]
-                low[c, axis], high[c, axis] = min(low[c, axis], way), max(high[c, axis], way)
+                least, most = min(least, way), max(most, way)
+            low[c, axis], high[c, axis] = least, most
     stride = 1
     for axis in range(dim - 1, -1, -1):
         _widen(low, high, stride)

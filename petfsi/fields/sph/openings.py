@@ -59,7 +59,7 @@ class Openings:
         self._inward = np.concatenate(
             [np.zeros((0, law.dim)), *(np.tile(inlet.inward, (len(inlet.feet), 1)) for inlet in inlets)]
         )
-        self._lost = 0.0
+        self._lost, self._at_rest = 0.0, False
         self._gone = self._strip = self._column = np.zeros(0, dtype=np.int64)
         self.kept: dict[str, np.ndarray] = {}
         self._way, self._speed, self._pressure = self._columns = np.zeros((3, int(ends[-1])))
@@ -78,7 +78,7 @@ class Openings:
 
     def hold(self, swarm: Swarm, rates: np.ndarray, dt: float) -> None:
         """Leave what is beyond sides its density, in the rates (n,) of the step; the work of pressure goes or comes."""
-        if not self.kept:
+        if self._at_rest:
             return
         rows = np.flatnonzero(self.room.beyond_inflow(swarm["x"]) | self.room.beyond_open(swarm["x"]))
         mine = rows[swarm.owned[rows]]
@@ -88,9 +88,10 @@ class Openings:
 
     def press(self, swarm: Swarm, p: np.ndarray, law: Law) -> None:
         """Give what is beyond sides its pressure, in p (n,), and the density to it. Collective."""
-        if not self.kept:
-            return
         self.law = law
+        if self._at_rest:
+            self._gone = self._strip = np.zeros(0, dtype=np.int64)
+            return
         self._gone = np.flatnonzero(self.room.beyond_open(swarm["x"]))
         self._strip = np.flatnonzero(self.room.beyond_inflow(swarm["x"]))
         self._set(swarm, p, self._gone, np.zeros(len(self._gone)))
@@ -124,7 +125,7 @@ class Openings:
 
         Forces on them from inside, known for the step of ``dt`` that ends now, are borne by what lies beyond.
         """
-        if not self.kept:
+        if self._at_rest:
             return
         self._bear(swarm, self._gone, gravity, dt)
         self._bear(swarm, self._strip, np.zeros(self.law.dim), dt)
@@ -149,6 +150,10 @@ class Openings:
             some = np.flatnonzero(inlet.holds(x))
             column[some] = part.start + inlet.columns(x[some])
         return column
+
+    def look(self, swarm: Swarm) -> None:
+        """See whether a particle can get beyond a side before pairs are listed again. Not collective."""
+        self._at_rest = not self.inlets and not (self.kept and self.room.beyond_open(swarm["x"], self.room.wide).any())
 
     # ---- who comes, who goes -----------------------------------------------------------------------------------------
 

@@ -29,9 +29,8 @@ class Pace:
         SolveError
             On all ranks, where a velocity or an acceleration is not finite.
         """
-        rho = swarm["rho"][swarm.owned]
-        dense = float(np.abs(rho / law.rho0 - 1.0).max(initial=0.0))
-        found = np.array([*(moves.fastest(swarm[name], swarm.owned) for name in ("v", "a")), dense])
+        v2, a2, low, high = moves.extremes(swarm["v"], swarm["a"], swarm["rho"], swarm.owned)
+        found = np.array([np.sqrt(v2), np.sqrt(a2), max(high / law.rho0 - 1.0, 1.0 - low / law.rho0, 0.0)])
         found[np.isnan(found)] = np.inf
         comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
         self._fastest, self._strongest, self._dense = found.tolist()

@@ -78,9 +78,9 @@ class Room:
         """Whether something may leave through a side."""
         return any("open" in (side, _rest(side)) for pair in self.sides for side in pair)
 
-    def beyond_open(self, x: np.ndarray) -> np.ndarray:
-        """Return which places x (n, dim) are beyond an open side."""
-        return self._beyond(x, ("open",), 0.0)
+    def beyond_open(self, x: np.ndarray, before: float = 0.0) -> np.ndarray:
+        """Return which places x (n, dim) are beyond an open side, or less than ``before`` (m) before it."""
+        return self._beyond(x, ("open",), -before)
 
     def beyond_inflow(self, x: np.ndarray) -> np.ndarray:
         """Return which places x (n, dim) are beyond an inflow, and beyond no open side."""
