@@ -111,6 +111,8 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
     time = scene.time
     steps = Stepping(time).count(MAX_COUNTED)
     number = f"{steps:,}" if steps is not None else "many"
+    if steps is None and fluid.step:
+        number = f"about {_count(time.end, fluid.step):,}"
     dt = time.dt if isinstance(time.dt, str) else f"{time.dt:g}"
     rows.append(("steps", f"{number} of {dt} s to {time.end:g} s, {time.integrator}"))
     if scene.output.every is not None:

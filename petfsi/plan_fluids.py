@@ -35,6 +35,8 @@ class FluidPlan:
         Of memory on all ranks together, and of one output.
     skipped : list of str
         What is neither allocated nor assembled for it, and why.
+    step : float or None
+        What limits steps to begin with, s, where something does.
     """
 
     rows: list[tuple[str, str]]
@@ -42,6 +44,7 @@ class FluidPlan:
     bytes: float
     output_bytes: float
     skipped: list[str]
+    step: float | None = None
 
 
 def fluid_plan(scene: Scene) -> FluidPlan:
@@ -103,7 +106,8 @@ def _sph(scene: Scene) -> FluidPlan:
     neighbours = PARTICLE_NEIGHBOURS[dim] * (law.s / law.spacing / 1.5) ** dim
     size = n * (PARTICLE_BYTES[dim] + (unknowns > 0) * neighbours * (2 * dim * ENTRY_BYTES + 16))
     size += n_walls * PARTICLE_BYTES[dim]
-    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), _sph_skipped(scene))
+    step = min(start.limits().values())
+    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), _sph_skipped(scene), step)
 
 
 def _sph_skipped(scene: Scene) -> list[str]:

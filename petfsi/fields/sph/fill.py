@@ -66,7 +66,7 @@ class Fill:
         """What a user should know of particles that were dropped."""
         told = {
             "lie outside the box": self.outside,
-            "lie in obstacles, or less than half a spacing before them": self.blocked,
+            "lie in obstacles or solids, or less than half a spacing before them": self.blocked,
             "lie in more than one shape, and count once": self.double,
         }
         return [f"fluid.fill: {n} places {what}" for what, n in told.items() if n]
