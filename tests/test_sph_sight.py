@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from petfsi.fields.sph.cells import Pairs, cell_grid, fluid_pairs, sorted_rows, wall_pairs
+from petfsi.fields.sph.cells import Pairs, cell_grid, fluid_pairs, sorted_rows
 from petfsi.fields.sph.sight import Sight
 from petfsi.fields.sph.thin import thin_facets, wet_on_both_sides
 
@@ -242,79 +242,20 @@ def test_surfaces_have_images():
 def test_nothing_is_fine(dim):
     points, facets = polyline([[0, 0.5], [1, 0.5]]) if dim == 2 else sheet(2)
     nobody, pairs, _ = listed(np.zeros((0, dim)))
-    empty = np.zeros((0, dim))
     sights = [
         Sight(facets, np.ones(len(facets), dtype=bool), REACH),
         Sight(facets, np.zeros(len(facets), dtype=bool), REACH),
         Sight(np.zeros((0, dim), dtype=int), np.zeros(0, dtype=bool), REACH),
     ]
-    x, some, (owned, first, counts) = listed(lattice(dim, 6))
-    to_wall = wall_pairs(x, owned, first, empty, owned[:0], 0 * first, counts, REACH)
+    x, some, _ = listed(lattice(dim, 6))
     for k, sight in enumerate(sights):
         sight.place(points, nobody)
         assert len(sight.strike(pairs, nobody).other) == 0
         assert len(sight.crossed(nobody, nobody, nobody, points, points, 1.0, 0.1).rows) == 0
         sight.place(points, x)
-        assert len(sight.strike_walls(to_wall, x, empty, empty, np.zeros(0, dtype=bool)).other) == 0
         if k > 0:
             assert sight.strike(some, x) is some
     assert len(thin_facets(points, np.zeros((0, dim), dtype=int), REACH)) == 0
-
-
-# pairs with walls
-
-
-@pytest.mark.parametrize("name", ("bent beam", "turned beam", "plate"))
-def test_dummies_are_seen_from_before_their_facets(name):
-    points, facets = BODIES[name]
-    dim = facets.shape[1]
-    corners = points[facets]
-    rng = np.random.default_rng(3)
-    thin = np.ones(len(facets), dtype=bool)
-    f = np.tile(np.arange(len(facets)), 3)[:600]
-    weights = rng.dirichlet(np.ones(dim), len(f))
-    foot = np.einsum("kc,kca->ka", weights, corners[f])
-    edges = corners[:, 1:] - corners[:, :1]
-    normal = edges[:, 0] @ np.array([[0, -1], [1, 0]]) if dim == 2 else np.cross(edges[:, 0], edges[:, 1])
-    normal = (normal / np.linalg.norm(normal, axis=1)[:, None])[f]
-    depth = rng.uniform(0, 3 * DX, len(f))
-    # and others that hang on a wall below, seen from everywhere
-    still = np.column_stack((rng.uniform(0, 1, (300, dim - 1)), np.full(300, 0.45)))
-    up = np.tile(np.eye(dim)[-1], (300, 1))
-    foot, normal = np.concatenate((foot, still)), np.concatenate((normal, up))
-    one_sided = np.arange(len(foot)) < len(f)
-    wall = foot - np.concatenate((depth, rng.uniform(0, 3 * DX, 300)))[:, None] * normal
-    x, _, (owned, first, counts) = listed(lattice(dim, 20 if dim == 2 else 9, noise=0.4))
-    grid = cell_grid(dim * [-1.0], dim * [2.0], REACH, dim * [False])
-    order, first_wall = sorted_rows(grid.of(wall), grid.counts, np.arange(len(wall)))
-    wall, foot, normal, one_sided = wall[order], foot[order], normal[order], one_sided[order]
-    pairs = wall_pairs(x, owned, first, wall, np.ones(len(wall), dtype=bool), first_wall, counts, REACH)
-    before = tuples(pairs)
-    p, y, n = x[before[:, 0]], foot[before[:, 1]], normal[before[:, 1]]
-    seen = ~one_sided[before[:, 1]] | (np.sum((p - y) * n, axis=1) > 0)
-    seen &= ~crossing(p, y + 1e-6 * (p - y), corners)
-    sight = Sight(facets, thin, REACH)
-    sight.place(points, x)
-    np.testing.assert_array_equal(tuples(sight.strike_walls(pairs, x, foot, normal, one_sided)), before[seen])
-    assert 0 < seen.sum() < len(seen)
-
-
-def test_each_face_of_a_plate_without_thickness_has_its_own_dummies():
-    points, facets = beam(np.column_stack((np.arange(-2, 23) / 20, np.full(25, 0.5))), 0.0)
-    foot = np.tile(lattice(2, 20)[::20, :1], (2, 1)) * [1, 0] + [0, 0.5]
-    normal = np.repeat([[0.0, 1.0], [0.0, -1.0]], 20, axis=0)
-    x, _, (owned, first, counts) = listed(lattice(2, 20))
-    grid = cell_grid([-1.0, -1.0], [2.0, 2.0], REACH, [False, False])
-    wall = foot - 0.5 * DX * normal
-    order, first_wall = sorted_rows(grid.of(wall), grid.counts, np.arange(40))
-    foot, normal, one_sided = foot[order], normal[order], np.ones(40, dtype=bool)
-    pairs = wall_pairs(x, owned, first, wall[order], one_sided, first_wall, counts, REACH)
-    before = tuples(pairs)
-    sight = Sight(facets, thin_facets(points, facets, REACH), REACH)
-    sight.place(points, x)
-    found = tuples(sight.strike_walls(pairs, x, foot, normal, one_sided))
-    above = x[before[:, 0], 1] > 0.5
-    np.testing.assert_array_equal(found, before[above == (normal[before[:, 1], 1] > 0)])
 
 
 # which facets are thin

@@ -22,7 +22,6 @@ import numpy as np
 
 from petfsi.fields.sph.cells import CellGrid, Pairs
 from petfsi.fields.sph.sight_cells import (
-    NOTHING,
     SAME,
     Clusters,
     boxes_of,
@@ -34,7 +33,7 @@ from petfsi.fields.sph.sight_cells import (
     sorted_into,
 )
 from petfsi.fields.sph.sight_guard import put_back, touching
-from petfsi.fields.sph.sight_lists import STRIKE, STRIKE_WALLS, WORDS
+from petfsi.fields.sph.sight_lists import STRIKE, WORDS
 
 #: Coarse cells so far apart along an axis share a bit.
 BITS = {2: 5, 3: 3}
@@ -125,34 +124,6 @@ class Sight:
             return pairs
         near = self._words(x, SAME)
         n = STRIKE[self.dim](pairs.start, pairs.other, x, near, self._fine, self._corners)
-        return Pairs(pairs.start, pairs.other[:n])
-
-    def strike_walls(self, pairs: Pairs, x, foot, normal, one_sided) -> Pairs:
-        """Return the pairs of particles and dummies that see each other: in the same memory.
-
-        A dummy is seen at its foot, past all facets but those that the foot lies on.
-
-        Parameters
-        ----------
-        pairs : Pairs
-            By fluid row the wall rows near it.
-        x : ndarray, shape (n, dim)
-            Of the fluid.
-        foot, normal : ndarray, shape (n_wall, dim)
-            Where dummies hang, m, and the unit normal there: into the fluid that they are for.
-        one_sided : ndarray of bool, shape (n_wall,)
-            Dummies of thin facets, whose places may be in the fluid behind: only seen from before the facet.
-        """
-        if not len(self._corners) and not one_sided.any():
-            return pairs
-        if len(self._corners):
-            # feet on the outermost plane of a cluster are beyond it
-            words, fine = (self._words(x, SAME), self._words(foot, -SAME)), self._fine
-        else:
-            words = np.zeros(len(x), np.uint64), np.zeros(len(foot), np.uint64)
-            fine = NOTHING
-        args = x, foot, normal, one_sided, *words, fine, self._corners
-        n = STRIKE_WALLS[self.dim](pairs.start, pairs.other, *args)
         return Pairs(pairs.start, pairs.other[:n])
 
     def _words(self, x, same: float) -> np.ndarray:

@@ -25,7 +25,6 @@ class _Cells(NamedTuple):
     item: np.ndarray
 
 
-NOTHING = _Cells((0.0,) * 3, (0.0,) * 3, (0,) * 3, np.zeros(1, np.int64), np.zeros(0, np.int32))
 
 
 class Clusters(NamedTuple):

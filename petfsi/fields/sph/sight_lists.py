@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from petfsi.fields.sph.sight_cells import BEFORE
 from petfsi.geometry.predicates import _exact_height, _sign_of_sum, _two_product, above, side
 
 _HALF = np.uint64(32)
@@ -272,40 +271,3 @@ def _compile_strike(dim):
 
 
 STRIKE = {dim: _compile_strike(dim) for dim in (2, 3)}
-
-
-def _compile_strike_walls(dim):
-    z = dim - 1
-
-    @njit(cache=True)
-    def strike_walls(start, other, x, foot, normal, one_sided, word, word_foot, cells, corners):
-        """Strike pairs of particles and dummies; return how many are left."""
-        kept, begin = start[0], start[0]
-        y = np.zeros(dim)
-        for i in range(len(start) - 1):
-            end = start[i + 1]
-            across = word[i] >> _HALF | word[i] << _HALF
-            for k in range(begin, end):
-                d = other[k]
-                height = 0.0
-                for a in range(dim):
-                    height += (x[i, a] - foot[d, a]) * normal[d, a]
-                seen = height > 0.0 or not one_sided[d]
-                # what is seen round a bend may be farther than words tell
-                if seen and (across & word_foot[d] != 0 or height <= 0.0):
-                    for a in range(dim):
-                        y[a] = foot[d, a] + BEFORE * (x[i, a] - foot[d, a])
-                    if dim == 2:
-                        seen = blocked_2d(x[i, 0], x[i, 1], x[i, z], y[0], y[1], y[z], cells, corners) < 0
-                    else:
-                        seen = blocked_3d(x[i, 0], x[i, 1], x[i, z], y[0], y[1], y[z], cells, corners) < 0
-                if seen:
-                    other[kept] = d
-                    kept += 1
-            begin, start[i + 1] = end, kept
-        return kept
-
-    return strike_walls
-
-
-STRIKE_WALLS = {dim: _compile_strike_walls(dim) for dim in (2, 3)}
