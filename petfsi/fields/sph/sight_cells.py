@@ -25,8 +25,6 @@ class _Cells(NamedTuple):
     item: np.ndarray
 
 
-
-
 class Clusters(NamedTuple):
     """Facets of a coarse cell together: normal, heights of the planes, box, and bit."""
 
