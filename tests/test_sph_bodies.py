@@ -15,12 +15,13 @@ G = 9.81
 HELD = [{"where": "all", "fix": ["x", "y"]}]
 
 
-def scene(shape, end, dx=0.04, depth=1.0, solid=(), **fluid):
+def scene(shape, end, dx=0.04, depth=1.0, solid=(), solids=None, **fluid):
     body = {"shape": shape, "density": 1000.0, "young": 1e9, "poisson": 0.3, **dict(solid or {"supports": HELD})}
     water = {"kind": "sph", "density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.2], "spacing": dx}
     water |= {"fill": [{"box": {"origin": [0.0, 0.0], "size": [1.0, depth]}}], "sides": {"top": "open"}, **fluid}
     time = {"end": end, "dt": "auto", "integrator": "newmark"}
-    return scene_from_dict({"dim": 2, "gravity": [0.0, -G], "time": time, "fluid": water, "solids": {"body": body}})
+    solids = solids or {"body": body}
+    return scene_from_dict({"dim": 2, "gravity": [0.0, -G], "time": time, "fluid": water, "solids": solids})
 
 
 def energy(fluid):
@@ -113,6 +114,34 @@ def test_a_flap_swung_in_water_lets_nothing_through():
     assert leaks == 0
     assert nearest < 0.024  # there was something to let through
     assert sim.fluid.law.pressure(sim.fluid.swarm["rho"]).max() < 3.0 * 1000.0 * G * 0.5
+
+
+def inside(x, low, high, by):
+    return int(np.all((x > np.array(low) + by) & (x < np.array(high) - by), axis=1).sum())
+
+
+def test_a_body_lifted_off_the_floor_is_not_hollow():
+    """Its bottom was dry at the start; the force swung by thousands of N, and four particles were in it."""
+    box = {"box": {"origin": [0.32, 0.0], "size": [0.36, 0.2], "cells": [3, 2]}}
+    lifted = [{"where": "all", "fix": ["x", "y"], "velocity": {"y": "0.3*min(1,t/0.2)"}}]
+    with only_options(DIRECT):
+        sim = prepared(scene(box, 0.8, depth=0.6, solid={"supports": lifted}))
+        forces(sim)
+    low = sim.fluid.skin.points.min(axis=0)
+    assert low[1] > 0.2
+    assert inside(sim.fluid.swarm["x"], low, low + [0.36, 0.2], 0.01) == 0
+
+
+def test_two_bodies_that_touch_are_both_filled():
+    grid = {"cells": [5, 5]}
+    left = {"shape": {"box": {"origin": [0.3, 0.3], "size": [0.2, 0.2]} | grid}, "density": 1.0, "young": 1e6}
+    right = {"shape": {"box": {"origin": [0.5, 0.3], "size": [0.2, 0.2]} | grid}, "density": 1.0, "young": 1e6}
+    bodies = {name: body | {"poisson": 0.3, "supports": HELD} for name, body in (("l", left), ("r", right))}
+    sim = prepared(scene({"box": {"origin": [0.3, 0.3], "size": [0.2, 0.2]} | grid}, 0.1, solids=bodies))
+    skin = sim.fluid.skin
+    assert len(skin.x) == 50 and skin.depth.min() > 0.0
+    places = np.stack(np.meshgrid(0.32 + 0.04 * np.arange(10), 0.32 + 0.04 * np.arange(5)), axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose(skin.x[np.lexsort(skin.x.round(6).T)], places, atol=1e-9)
 
 
 @pytest.mark.parallel([1, 2])

@@ -6,7 +6,7 @@ from petsc4py import PETSc  # noqa: F401 - starts MPI's partner before the field
 from test_sph import SELF, WORLD, Stored, owned, prepared, scene, whole
 
 from petfsi.errors import InputError
-from petfsi.scene.load import dump_scene, load_scene
+from petfsi.scene.load import dump_scene, load_scene, scene_from_dict
 
 U = 1.0
 
@@ -222,3 +222,19 @@ def test_a_scene_with_such_sides_is_written_as_it_was_read(tmp_path):
     made = channel({"top": PLATE, "left": jet("1 + t", ramp=0.1)}, viscosity=1.0)
     (tmp_path / "scene.toml").write_text(dump_scene(made))
     assert load_scene(tmp_path / "scene.toml") == made
+
+
+@pytest.mark.parallel([1, 2])
+def test_what_flies_over_the_rim_of_an_open_box_is_gone():
+    """It fell behind the wall, and stopped the run."""
+    fluid = {"kind": "sph", "density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "spacing": 0.04}
+    fluid |= {"pressure": "none", "initial": {"velocity": ["where(y>0.5,1.0,0)", "where(y>0.5,2.0,0)"]}}
+    ball = {"ball": {"centre": [0.7, 0.85], "radius": 0.08}}
+    fluid |= {"fill": [{"box": {"origin": [0.0, 0.0], "size": [1.0, 0.2]}}, ball], "sides": {"top": "open"}}
+    time = {"end": 0.6, "dt": "auto"}
+    sim = prepared(scene_from_dict({"dim": 2, "gravity": [0.0, -9.81], "time": time, "fluid": fluid}))
+    start = sim.fluid.tally()
+    run(sim)
+    drop = 1000.0 * np.pi * 0.08**2
+    assert sim.fluid.tally()["mass_out"] == pytest.approx(drop, rel=0.1)
+    assert abs(balance(sim, start)) < 1e-9

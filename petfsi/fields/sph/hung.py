@@ -17,6 +17,7 @@ from petfsi.fields.sph.rims import Rims, unit_normals
 from petfsi.fields.sph.solids import SAME, nearest, pseudonormals
 from petfsi.fields.sph.thin import sampled
 from petfsi.geometry.slabs import area_vectors
+from petfsi.geometry.surfaces import shells
 
 #: What is as near as so many spacings to a wall particle at rest is in a wall.
 TAKEN = 0.75
@@ -89,10 +90,21 @@ def hang(
         x -= past.depth[:, None] * unit_normals(points, facets)[past.facet]
         past = past.only(cKDTree(taken).query(x)[0] > TAKEN * dx)
     found += past
+    label, _ = shells(points, facets)
     wet = _wet(points, facets, dx, taken)
-    if not np.all(thin | ~wet):
-        found += _inside(points, facets, wet, thin, dx, layers)
+    for shell in np.unique(label[~thin & wet]):
+        inside = _inside(points, facets, np.flatnonzero(label == shell), wet, dx, layers)
+        found += inside.only(_free(inside, points, facets, dx, taken))
     return found
+
+
+def _free(hung: Hung, points, facets, dx: float, taken) -> np.ndarray:
+    """Return which of these, past no rims, are in no wall at rest."""
+    if not len(taken):
+        return np.ones(len(hung.facet), dtype=bool)
+    x = np.einsum("na,nad->nd", hung.weights, points[facets[hung.facet]])
+    x -= hung.depth[:, None] * unit_normals(points, facets)[hung.facet]
+    return cKDTree(taken).query(x)[0] > TAKEN * dx
 
 
 def _wet(points, facets, dx: float, taken) -> np.ndarray:
@@ -130,25 +142,27 @@ def _past_rims(points, facets, rims: Rims, which, dx: float, layers: int) -> Hun
     return _layered(rims.facet[rim], weights, rim, way, np.zeros(len(rim)), length * dx**2, dx, layers)
 
 
-def _inside(points, facets, wet, thin, dx: float, layers: int) -> Hung:
-    deep, which = layers * dx, np.flatnonzero(wet)
-    corners, normals = points[facets], pseudonormals(points, facets)
+def _inside(points, facets, which, wet, dx: float, layers: int) -> Hung:
+    """Return what fills one body, of these facets, as far behind all of them as particles see; it hangs on wet ones."""
+    deep, corners = layers * dx, points[facets]
+    normals = pseudonormals(points, facets[which])
 
     def measure(x):
-        depth, normal = nearest(x, corners[which], normals[which], deep + dx, dx)
+        depth, normal = nearest(x, corners[which], normals, deep + dx, dx)
         return np.where(np.isinf(depth), -np.inf, depth), normal
 
-    x, volume = _on_lattice(points, unit_normals(points, facets), dx)
+    own = points[np.unique(facets[which])]
+    x, volume = _on_lattice(own, unit_normals(points, facets[which]), dx)
     if x is None:
-        lattice, cell = _fine_lattice(points, measure, dx, layers)
+        lattice, cell = _fine_lattice(own, measure, dx, layers)
         x, volume, normal, depth = in_layers(lattice, cell, dx, layers, measure)
     else:
         depth, normal = measure(x)
         kept = (depth > 0.0) & (depth < deep)
         x, volume, depth, normal = x[kept], volume[kept], depth[kept], normal[kept]
-    sample, owner = sampled(corners[which], 0.5 * dx)
-    facet = which[owner][cKDTree(sample).query(x + depth[:, None] * normal)[1]]
-    x, volume, facet = (part[~thin[facet]] for part in (x, volume, facet))
+    wet = which[wet[which]]
+    sample, owner = sampled(corners[wet], 0.5 * dx)
+    facet = wet[owner][cKDTree(sample).query(x + depth[:, None] * normal)[1]]
     unit = unit_normals(points, facets)[facet]
     depth = -np.sum((x - corners[facet, 0]) * unit, axis=1)
     edges = np.swapaxes(corners[facet, 1:] - corners[facet, :1], 1, 2)

@@ -164,7 +164,7 @@ class Openings:
         """
         if not self.kept:
             return
-        gone = swarm.owned & self.room.is_out_of_sight(swarm["x"]) & self.room.beyond_open(swarm["x"])
+        gone = swarm.owned & self.room.has_left(swarm["x"])
         back = np.zeros(len(swarm), dtype=bool)
         for inlet in self.inlets:
             deep = inlet.holds(swarm["x"] + inlet.depth * inlet.inward)

@@ -87,10 +87,14 @@ class Room:
         out = self._beyond(x, ("inflow",), 0.0)
         return out & ~self.beyond_open(x) if self.is_open and out.any() else out
 
-    def is_out_of_sight(self, x: np.ndarray) -> np.ndarray:
-        """Return which places x (n, dim) cannot be seen from inside the box."""
+    def has_left(self, x: np.ndarray) -> np.ndarray:
+        """Return which places x (n, dim) are beyond an open side, and not seen from inside or beyond the rim of a wall.
+
+        What falls past a rim would else be behind the wall.
+        """
+        out = self.beyond_open(x)
         way = np.where(self.grid.periodic, 0.0, x - np.clip(x, self.low, self.high))
-        return np.sum(way**2, axis=1) > self.reach**2
+        return out & ((np.sum(way**2, axis=1) > self.reach**2) | self._beyond(x, ("slip", "no-slip"), 0.0))
 
     def _beyond(self, x: np.ndarray, kinds: tuple[str, ...], by: float) -> np.ndarray:
         out = np.zeros(len(x), dtype=bool)
