@@ -41,6 +41,11 @@ BENCHES = {
     "particle-speed": Bench(
         "steps a second of particles in tanks in 2D and 3D, and beside a beam: phases, memory", "5 min", "1 min"
     ),
+    "particle-coupling": Bench(
+        "largest stable step of particles beside an elastic body: solves and schemes over density and stiffness",
+        "7 min",
+        "1 min",
+    ),
     "solver": Bench("one solve over density ratio, stiffness, step and grid, against others", "20 min", "20 s"),
 }
 
