@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from petfsi.bench import particles, particles_choices, particles_dam, particles_data, particles_flows, particles_tank
+from petfsi.bench import (
+    bodies_data,
+    particle_bodies,
+    particles,
+    particles_choices,
+    particles_dam,
+    particles_data,
+    particles_flows,
+    particles_tank,
+)
 from petfsi.bench.case import Case
 from petfsi.bench.report import Report
 
@@ -18,6 +27,26 @@ def test_measured_series_are_whole():
     assert len(particles_data.BUCHNER_T) == len(particles_data.BUCHNER_P)
     assert all(len(series) == len(particles_data.COURCY_T) for series in particles_data.COURCY.values())
     assert max(particles_data.BUCHNER_P) == 0.887
+
+
+def test_published_bends_have_the_bounds_that_the_bench_asks_for():
+    largest = {name: max(x for _, x in series) for name, series in bodies_data.GATE_X.items()}
+    assert largest.pop("Antoci") == particle_bodies.GATE_PEAK[1]
+    assert min(largest.values()) == particle_bodies.GATE_PEAK[0]
+    assert set(bodies_data.GATE_Y) == set(bodies_data.GATE_X)
+    bent = [max(x for _, x in series) for series in bodies_data.OBSTACLE.values()]
+    assert (min(bent), np.floor(max(bent))) == particle_bodies.OBSTACLE_PEAK
+    for table in (bodies_data.GATE_X, bodies_data.GATE_Y, bodies_data.OBSTACLE):
+        for series in table.values():
+            assert np.all(np.diff([t for t, _ in series]) > 0)
+
+
+def test_peaks_and_arrivals_are_read_from_histories():
+    t = np.linspace(0.0, 1.0, 101)
+    seen = np.column_stack([t, 10 * np.sin(np.pi * t), 0 * t])
+    assert particle_bodies.peak(seen) == pytest.approx((10.0, 0.5))
+    assert particle_bodies.arrival(seen) == pytest.approx(np.arcsin(0.2) / np.pi, abs=1e-4)
+    assert np.isnan(particle_bodies.arrival(seen * [1.0, 0.1, 1.0]))
 
 
 def test_exact_channel_flows_begin_and_end_as_they_must():
@@ -79,3 +108,16 @@ def test_the_quick_bench_measures_some_of_the_choices():
     assert set(particles_choices.QUICK) <= set(particles_choices.settings())
     assert particles_choices.settings()[particles_choices.DEFAULT] == {"kernel": "wendland", "smoothing": 1.5}
     assert Case(WORLD, True).quick
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("name", particle_bodies.OBSTACLES)
+def test_solids_that_water_bends_are_looked_at(name):
+    """Before the water comes the obstacle leans back by nothing but what its own weight does: nothing."""
+    sets = {"fluid.artificial_viscosity": 0.05} | particle_bodies.OBSTACLES[name]
+    seen, wrong = particle_bodies.bend(WORLD, "dambreak", 0.0146, 0.02, sets)
+    assert np.abs(seen[:, 1]).max() < 0.05 and len(seen) > 10
+    assert wrong < 0.02 * particle_bodies.OBSTACLE_STORED
+    if name == "beam":
+        opened, _ = particle_bodies.bend(WORLD, "elastic-gate", 0.0025, 0.02, {})
+        assert 2.0 < opened[-1, 1] < 6.0  # the codes have 4.4 to 5.3
