@@ -47,6 +47,9 @@ def test_peaks_and_arrivals_are_read_from_histories():
     assert particle_bodies.peak(seen) == pytest.approx((10.0, 0.5))
     assert particle_bodies.arrival(seen) == pytest.approx(np.arcsin(0.2) / np.pi, abs=1e-4)
     assert np.isnan(particle_bodies.arrival(seen * [1.0, 0.1, 1.0]))
+    lines = [((0.0, 0.0), (1.0, 1.0)), ((0.0, 2.0), (0.9, 2.9))]
+    assert particle_bodies.apart(np.column_stack([t, t + 1, t]), lines, 2.0) == pytest.approx(0.0, abs=1e-12)
+    assert particle_bodies.apart(np.column_stack([t, t + 4, t]), lines, 2.0) == pytest.approx(3.0)
 
 
 def test_exact_channel_flows_begin_and_end_as_they_must():
