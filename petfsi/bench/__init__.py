@@ -46,7 +46,7 @@ BENCHES = {
     ),
     "particle-coupling": Bench(
         "largest stable step of particles beside an elastic body: solves and schemes over density and stiffness",
-        "7 min",
+        "4 min",
         "1 min",
     ),
     "solver": Bench("one solve over density ratio, stiffness, step and grid, against others", "20 min", "20 s"),

@@ -12,7 +12,7 @@ exceed what there was, nor the momentum change. Its mass is ``ratio`` times that
 
 Steps are c h/s = 0.9 / 2^k: petfsi refuses longer ones, as particles are explicit in sound. ``step`` is the largest
 (over the longest) at which the energy stays within ``SLACK`` of its bound for 50 of the longest steps, ``energy`` its
-largest value then over that at the start, ``momentum`` the largest change over the start's. ``settles`` is the largest
+largest value then over that at the start, ``momentum`` its largest change, over the start's. ``settles`` is the largest
 at which the energy may pass its bound at first but grows no more: bounded all the same. ``longest`` is what becomes of
 the longest step: how large the energy gets, or why there is none.
 """
@@ -153,9 +153,9 @@ def _of(report: Report, part: str, name: str) -> tuple[list[float], list[list[Ro
 def _map(report: Report, part: str, name: str) -> list[str]:
     """Return the map of a solve in lines of text."""
     young, lines = _of(report, part, name)
-    head = f"{part:>8}, {name:<16} E =" + "".join(f"{E:>10.0e}" for E in young)
+    head = f"{part:>8}, {name:<16} E =" + "".join(f"{E:>13.0e}" for E in young)
     names = [f"ratio {ratio:g}" for ratio in RATIOS]
-    body = [f"{n:>29}" + "".join(f"{_step(row):>10}" for row in line) for n, line in zip(names, lines, strict=True)]
+    body = [f"{n:>29}" + "".join(f"{_step(row):>13}" for row in line) for n, line in zip(names, lines, strict=True)]
     return [head, *body]
 
 
@@ -177,7 +177,7 @@ def _picture(report: Report) -> Figure:
     young, lines = _of(report, "no-slip", "split")
     for line in lines:
         panels[0, 3].loglog(young, [row["momentum"] for row in line], "o-", label=f"ratio {line[0]['ratio']:g}")
-    panels[0, 3].set(xlabel="E, Pa", title="split: change of momentum")
+    panels[0, 3].set(xlabel="E, Pa", title="split: change of momentum at that step")
     panels[0, 3].legend(fontsize=7)
     return figure
 
@@ -188,7 +188,7 @@ def _draw(axes: Axes, report: Report, part: str, name: str) -> None:
     axes.imshow(np.log2(np.maximum(step, 0.5**HALVINGS)), cmap="RdYlGn", vmin=-10, vmax=0, aspect="auto")
     for i, line in enumerate(lines):
         for j, row in enumerate(line):
-            axes.text(j, i, _step(row), ha="center", va="center", fontsize=7)
+            axes.text(j, i, _step(row).replace(" ", "\n"), ha="center", va="center", fontsize=7)
     axes.set_xticks(range(len(young)), [f"{np.log10(E):.0f}" for E in young])
     axes.set_yticks(range(len(RATIOS)), [f"{ratio:g}" for ratio in RATIOS])
     axes.set(xlabel="lg E/Pa", ylabel="density ratio", title=f"{part}: {name}")
