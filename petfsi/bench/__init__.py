@@ -55,7 +55,7 @@ BENCHES = {
 
 def describe() -> str:
     """Return the list of benches."""
-    lines = [f"  {name:<12}{b.about} ({b.whole}; --quick {b.quick})" for name, b in BENCHES.items()]
+    lines = [f"  {name:<19}{b.about} ({b.whole}; --quick {b.quick})" for name, b in BENCHES.items()]
     return "\n".join(["petfsi bench NAME measures one of", *lines])
 
 
