@@ -181,12 +181,15 @@ def spread(x: np.ndarray, anchor: np.ndarray, first: np.ndarray, counts: np.ndar
     counts : ndarray of int, shape (dim,)
         See ``Swarm``.
     """
-    dim, n_cells = x.shape[1], first.size - 1
+    dim, layer = x.shape[1], (first.size - 1) // counts[0]
+    # others hold nothing: layers of cells before the first that has a row, and after the last
+    c0 = (np.searchsorted(first, first[0], side="right") - 1) // layer * layer
+    n_cells = max((np.searchsorted(first, first[-1]) - 1) // layer * layer + layer - c0, 0)
     low, high = np.full((n_cells, dim), np.inf), np.full((n_cells, dim), -np.inf)
     for c in range(n_cells):
         for axis in range(dim):
             least, most = np.inf, -np.inf
-            for i in range(first[c], first[c + 1]):
+            for i in range(first[c0 + c], first[c0 + c + 1]):
                 way = x[i, axis] - anchor[i, axis]
                 least, most = min(least, way), max(most, way)
             low[c, axis], high[c, axis] = least, most
@@ -196,7 +199,7 @@ def spread(x: np.ndarray, anchor: np.ndarray, first: np.ndarray, counts: np.ndar
         stride *= counts[axis]
     most = 0.0
     for c in range(n_cells):
-        rest, size2, inner = c, 0.0, True
+        rest, size2, inner = c0 + c, 0.0, True
         for axis in range(dim - 1, -1, -1):
             rest, k = rest // counts[axis], rest % counts[axis]
             inner &= 0 < k < counts[axis] - 1
