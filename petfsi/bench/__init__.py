@@ -39,7 +39,7 @@ BENCHES = {
         "vortices, channels, still water and dams that break, against exact and measured ones", "10 min", "1 min"
     ),
     "particle-bodies": Bench(
-        "particles that bend an elastic gate and an obstacle, against an experiment and codes", "12 min", "1 min"
+        "particles that bend an elastic gate and an obstacle, against an experiment and codes", "10 min", "1 min"
     ),
     "particle-speed": Bench(
         "steps a second of particles in tanks in 2D and 3D, and beside a beam: phases, memory", "5 min", "1 min"
