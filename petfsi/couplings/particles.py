@@ -10,6 +10,12 @@ that the densities of the step saw and E_i = sum_d m_d F r_id lambda_d the row o
 
     delta p_i = -h c_i^2 E_i (u - u^),        K_w = 2 h sum_i (m_i c_i^2 / rho_i^2) E_i^T E_i,
 
+With ``bdf2`` and the mean forces m of steps, r the ratio of their lengths, the solid gets
+
+    F = (1 + 2 r)/(1 + r) m^{n+1} - r/(1 + r) m^n,
+
+which gives it h m in each, as particles get: that, too, keeps momentum to round-off.
+
 K_w u stands in the solid's block and K_w u^ on the right, and after the solve the particles take their share of the
 same pairs: delta rho_i = delta p_i / c_i^2 and the force that goes with it.
 """
@@ -49,7 +55,13 @@ class PressureTransfer(Coupling):
         self.blocks: dict[tuple[str, str], PETSc.Mat] = {} if self.drag is None else self.drag.blocks
         self._take(surface)
         self._mean = self.skin.last
-        self.theta = THETA.get(fluid.scene.time.integrator, 1.0)
+        self.theta = MEAN.get(fluid.scene.time.integrator, 1.0)
+        self._is_bdf2 = fluid.scene.time.integrator == "bdf2"
+        # the last step's length, and the mean force in it
+        self._before = np.zeros(1 + self.skin.last.size)
+        if self._is_bdf2:
+            fluid.kept["mean_force"] = self._before
+        self._lead, self._lag = 1.0, np.zeros_like(self.skin.last)
 
     def _take(self, surface: Surface) -> None:
         """Take the surface's maps, and their transpose for this rank's unknowns."""
@@ -68,6 +80,11 @@ class PressureTransfer(Coupling):
         self.skin.place(points, velocity)
         self.fluid.push(time, dt)
         # an explicit solid's block is diagonal: its step is short, and it goes without
+        self._lead, self._lag = 1.0, np.zeros_like(self.skin.last)
+        if self._is_bdf2 and self.fluid.is_moving and self._before[0] > 0.0:
+            ratio = dt / self._before[0]
+            self._lead = (1 + 2 * ratio) / (1 + ratio)
+            self._lag = ratio / (1 + ratio) * self._before[1:].reshape(self._lag.shape)
         answers = self.fluid.is_moving and not self.solid.explicit
         self._answer = _Answer(self.fluid, dt if answers else 0.0)
         self.solid.take_mass(None if self.solid.explicit else self._stiffening())
@@ -75,7 +92,7 @@ class PressureTransfer(Coupling):
     def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return this rank's rows of K_w, as far as it counts in this step, and of the drag's. Collective."""
         rows = (self._answer.rows @ self.surface.point_map).tocsr()
-        weighted = rows.multiply(self.theta * self._answer.weight[:, None]).tocsr()
+        weighted = rows.multiply(self._lead * self.theta * self._answer.weight[:, None]).tocsr()
         product = (rows.T @ weighted).tocoo()
         self._unknown_rows = rows
         i, j, values = product.row, product.col, product.data
@@ -91,12 +108,12 @@ class PressureTransfer(Coupling):
             self._mean = (1 - self.theta) * self.skin.last + self.theta * force + self.skin.impulse / dt
         else:
             self._mean = self.skin.last = force
-        self.solid.rhs += self._to_unknowns @ self._mean.ravel()
+        self.solid.rhs += self._to_unknowns @ (self._lead * self._mean - self._lag).ravel()
         self.n_assembled += 1
         if self.solid.explicit:
             return
         seen = self.skin.velocity.ravel() - self.surface.fixed_map @ self.solid.fixed_velocity()
-        part = self._unknown_rows.T @ (self.theta * self._answer.weight * (self._answer.rows @ seen))
+        part = self._unknown_rows.T @ (self._lead * self.theta * self._answer.weight * (self._answer.rows @ seen))
         here = np.flatnonzero(part)
         self.solid.rhs += gather_sums(self.comm, self.solid.layout, here, part[here])
         if self.drag is not None:
@@ -114,7 +131,7 @@ class PressureTransfer(Coupling):
         if not self.surface.fixed_map.nnz or self.comm.rank:
             return Work()
         held = self.surface.fixed_map @ self.solid.fixed_velocity()
-        force = self._mean + self.skin.to_points(self.skin.drag)
+        force = self._lead * self._mean - self._lag + self.skin.to_points(self.skin.drag)
         return Work(boundary=-dt * float(force.ravel() @ held))
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
@@ -126,6 +143,7 @@ class PressureTransfer(Coupling):
         self.comm.Allreduce(change, total)
         total = total.reshape(-1, self.fluid.dim)
         self._mean = self._mean + self.theta * total
+        self._before[0], self._before[1:] = dt, self._mean.ravel()
         self.skin.solution = new.reshape(-1, self.fluid.dim)
         self.skin.last = self.skin.to_points(self.skin.force) + total
         self.restored()
@@ -137,8 +155,10 @@ class PressureTransfer(Coupling):
 
 #: Part of the force at the end of a step in what the solid gets in it, by integrator; the rest is that at its start.
 #: Particles get half of each: with that momentum is kept to round-off where the scheme gives a force's impulse at once.
-#: Others get that at the end: bdf2 keeps a combination of three steps anyway, and midpoint blows up with halves.
+#: Others get that at the end: midpoint blows up with halves.
 THETA = {"newmark": 0.5, "symplectic-euler": 0.5}
+#: Here bdf2 does, too: its force is put together from the means of two steps, as its momentum is from three.
+MEAN = THETA | {"bdf2": 0.5}
 
 
 class _Answer:
