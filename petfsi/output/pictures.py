@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +131,7 @@ def _plane_figure(stage: Stage, frame: Frame) -> Figure:
             many = len(stage.cells) * 3 >= _MANY_EDGES
             _draw_polygons(ax, list(frame.points[stage.cells]), _body_colours(stage), many)
         else:
-            style: dict[str, Any] = {"shading": "gouraud", "cmap": SHOWN[stage.shown][1], "norm": stage.norm}
+            style: dict[str, Any] = {"shading": "gouraud", "cmap": SHOWN[stage.shown][1], "norm": deepcopy(stage.norm)}
             x, y = frame.points.T
             mappable = ax.tripcolor(x, y, np.asarray(quantity(frame, stage.shown)), triangles=stage.cells, **style)
         border = boundary_facets(frame.points, stage.cells)
@@ -195,7 +196,8 @@ def _draw_particles(
         near = np.argsort(-distance, kind="stable")  # the nearest on top
         near = near[distance[near] <= stage.spacing]
         x, colours = x[near], colours[near]
-    style: dict[str, Any] = {"cmap": SHOWN[stage.shown][1], "norm": stage.norm, "linewidths": 0.0}
+    # a norm of its own: those who watch one are miscounted where pictures that share it are collected
+    style: dict[str, Any] = {"cmap": SHOWN[stage.shown][1], "norm": deepcopy(stage.norm), "linewidths": 0.0}
     size = [stage.spacing]
     places: dict[str, Any] = {"units": "xy", "offsets": x[:, list(across)], "offset_transform": ax.transData}
     disks = EllipseCollection(size, size, [0.0], array=colours, **places, **style)
@@ -221,7 +223,7 @@ def _draw_cells(
     a, b = across
     extent = (stage.low[a], stage.high[a], stage.low[b], stage.high[b])
     style: dict[str, Any] = {"origin": "lower", "extent": extent, "aspect": "equal", "interpolation": "nearest"}
-    image = ax.imshow(values.T, cmap=SHOWN[stage.shown][1], norm=stage.norm, **style)
+    image = ax.imshow(values.T, cmap=SHOWN[stage.shown][1], norm=deepcopy(stage.norm), **style)
     if kind is not None:
         rigid = np.where((kind == OBSTACLE) | (kind == OUTSIDE), 1.0, np.nan)
         ax.imshow(rigid.T, cmap=ListedColormap([GREY]), **style)
