@@ -312,7 +312,8 @@ def resume_run(
             raise InputError(
                 f"{directory}: no checkpoint can be read; start again with 'petfsi run {files.scene} --out ...'"
             )
-        unread = simulation.prepare()  # of the scene's start: it would move the fluid's faces to the restored solid
+        # of the scene's start: it would move the fluid's faces to the restored solid
+        unread = simulation.prepare(resumes=True)
         simulation.forget()
         with checkpoints.read_checkpoint(found, comm) as stored:
             simulation.restore(stored.step, stored.time, stored.dt, stored.group)
@@ -334,7 +335,7 @@ def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
-    for note in simulation.fluid.notes if simulation.fluid else []:
+    for note in [*(simulation.fluid.notes if simulation.fluid else []), *simulation.notes]:
         console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")
