@@ -148,7 +148,12 @@ def regions_scene(wall, hollow, top="slip", velocity=None, gravity=(0.3, -9.81))
     """A box 2 m by 1 m; the wall leaves a room at its right that no solid touches."""
     sides = {"left": "slip", "right": "slip", "bottom": "slip", "top": top}
     fluid = {"origin": [0.0, 0.0], "size": [2.0, 1.0], "density": 1000.0, "cells": [64, 32], "sides": sides}
-    scene = {"dim": 2, "gravity": list(gravity), "time": {"end": 1.0, "dt": 0.01}, "fluid": fluid}
+    scene = {
+        "dim": 2,
+        "gravity": list(gravity),
+        "time": {"end": 1.0, "dt": 0.01, "integrator": "newmark"},
+        "fluid": fluid,
+    }
     scene |= {"coupling": {"transfer": "cutcell"}, "obstacles": {"wall": WALL} if wall else {}}
     solid = HOLLOW | ({"initial": {"velocity": velocity}} if velocity else {})
     return Scene.model_validate(scene | ({"solids": {"box": solid}} if hollow else {}))

@@ -597,7 +597,7 @@ def test_a_dumped_scene_is_the_scene(tmp_path, text):
 
 def test_a_dumped_scene_names_every_setting():
     data = tomllib.loads(dump_scene(scene_from_dict(layer())))
-    assert data["time"]["integrator"] == "newmark" and data["checkpoint"]["keep"] == 3
+    assert data["time"]["integrator"] == "bdf2" and data["checkpoint"]["keep"] == 3
     assert data["fluid"]["sides"]["left"] == "slip" and "back" not in data["fluid"]["sides"]
     assert data["solids"]["layer"]["damping"] == {"mass": 0.0, "stiffness": 0.0}
     assert data["solids"]["layer"]["density"] == 1200.0

@@ -26,7 +26,7 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Number, Field(description="s")]
-    integrator: Annotated[str, BeforeValidator(one_of(INTEGRATORS))] = "newmark"
+    integrator: Annotated[str, BeforeValidator(one_of(INTEGRATORS))] = "bdf2"
     above_limit: Annotated[
         Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
     ] = "refuse"
