@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
 from petfsi.errors import TouchError
 from petfsi.fields.base import SolidField
@@ -14,6 +15,7 @@ from petfsi.geometry.bodies import enclosed
 from petfsi.geometry.collisions import Meeting, Way, crossings
 from petfsi.geometry.obstacles import named_surfaces, side_walls
 from petfsi.geometry.touching import depths, drawn_in, first_on_ways, shortest_edges, stations, straight_parts
+from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import images, periods
 
@@ -70,11 +72,11 @@ class _Roots(NamedTuple):
     limit: np.ndarray
 
 
-def watch(scene: Scene, solid: SolidField | None) -> Watch | None:
+def watch(comm: MPI.Comm, scene: Scene, solid: SolidField | None) -> Watch | None:
     """Return what watches the bodies of a scene at its start; None if there is nothing that could meet. Collective."""
     if solid is None or (len(scene.solids) < 2 and not scene.obstacles and not side_walls(scene)):
         return None
-    return Watch(scene, solid)
+    return Watch(comm, scene, solid)
 
 
 class Watch:
@@ -90,6 +92,7 @@ class Watch:
 
     Parameters
     ----------
+    comm : MPI.Comm
     scene : Scene
     solid : SolidField
         At the start.
@@ -100,10 +103,10 @@ class Watch:
         What a user should know of how bodies begin.
     """
 
-    def __init__(self, scene: Scene, solid: SolidField) -> None:
+    def __init__(self, comm: MPI.Comm, scene: Scene, solid: SolidField) -> None:
         self._period = periods(scene.fluid, scene.dim)
         self._x = solid.surface_present()
-        self._things = _bodies(scene, solid, self._x) + _still(scene)
+        self._things = _bodies(scene, solid, self._x) + on_root(comm, lambda: _still(scene))
         self._n = len(scene.solids)
         bodies, others = np.triu_indices(self._n, 1, len(self._things))
         self._pairs = np.column_stack((bodies, others))
