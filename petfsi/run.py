@@ -334,7 +334,8 @@ def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
-    for note in simulation.fluid.notes if simulation.fluid else []:
+    notes = simulation.fluid.notes if simulation.fluid else []
+    for note in notes + (simulation.watch.notes if simulation.watch else []):
         console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")

@@ -13,7 +13,7 @@ from petfsi import build, petsc
 from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
-from petfsi.errors import SolveError
+from petfsi.errors import SolveError, TouchError
 from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
@@ -21,6 +21,7 @@ from petfsi.scene.stepping import Stepping
 from petfsi.solve import Outcome, Solver
 from petfsi.substeps import StableStep
 from petfsi.system import System
+from petfsi.touch import watch
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
 
@@ -79,6 +80,7 @@ class Simulation:
         self.regions: ClosedRegions | None = None
         if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
+        self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
@@ -134,7 +136,7 @@ class Simulation:
         try:
             self._attempt(t, dt)
         except SolveError as error:
-            if retries == 0:
+            if retries == 0 or isinstance(error, TouchError):
                 raise
             why = str(error).split(": ")[0]
             self.report(f"t = {t:.6g} s: the step of {dt:g} s is taken again as two halves: {why}")
@@ -235,6 +237,8 @@ class Simulation:
         if self.solid:
             self._check_speed(self.solid, values["solid"], dt)
             self.solid.judge(values["solid"], dt)
+            if self.watch:
+                self.watch.judge(self.solid.surface_arrival(values["solid"], dt), t, dt)
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
             coupling.accept(values, t, dt)
@@ -328,6 +332,8 @@ class Simulation:
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
+        if self.solid and self.watch:
+            self.watch.resume(self.solid)
         for coupling in self.couplings:
             coupling.restored()
         if self.regions:

@@ -380,6 +380,14 @@ class SolidField(Field):
         """Return the wet surface, the same on every rank; another object where its maps have changed. Collective."""
 
     @abstractmethod
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points as numbered in the scene, ascending in each part. Not collective."""
+
+    @abstractmethod
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points supports hold where they are, along all axes. Not collective."""
+
+    @abstractmethod
     def surface_positions(self) -> np.ndarray:
         """Return the positions of its points, shape (n_points, dim), on every rank. Collective.
 

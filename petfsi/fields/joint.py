@@ -241,6 +241,16 @@ class JointSolid(SolidField):
         ]
         return vstack(renumbered, format="csr")
 
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points as numbered in the scene."""
+        numbers = [np.array([self.names.index(name) for name in part.names]) for part in self.parts]
+        every = zip(numbers, self.parts, strict=True)
+        return np.concatenate([number[part.surface_bodies()] for number, part in every])
+
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points supports hold where they are, along all axes."""
+        return np.concatenate([part.surface_rooted() for part in self.parts])
+
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, dim). Collective."""
         return np.concatenate([part.surface_positions() for part in self.parts])

@@ -439,6 +439,11 @@ class NodalSolid(SolidField):
             there = self.comm, self.layout, self._integrator, self._motion()
             self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)
 
+    def _still_nodes(self) -> np.ndarray:
+        """Return which nodes, in the scene's own order, supports hold where they are, along all axes."""
+        axes = self.width * self._number.astype(np.int64)[:, None] + np.arange(self.dim)
+        return np.isin(axes, self._supports.still).all(axis=1)
+
     def along_axes(self, x: np.ndarray) -> np.ndarray:
         """Return the velocities along the axes, shape (n_owned, dim); a beam's rotations are none."""
         return x.reshape(-1, self.width)[:, : self.dim]
