@@ -12,9 +12,17 @@ from mpi4py import MPI
 from petfsi.errors import TouchError
 from petfsi.fields.base import SolidField
 from petfsi.geometry.bodies import enclosed
-from petfsi.geometry.collisions import Meeting, Way, crossings
+from petfsi.geometry.collisions import Meeting, Way, any_within, crossings
 from petfsi.geometry.obstacles import named_surfaces, side_walls
-from petfsi.geometry.touching import depths, drawn_in, first_on_ways, shortest_edges, stations, straight_parts
+from petfsi.geometry.touching import (
+    depths,
+    drawn_in,
+    first_on_ways,
+    shortest_edges,
+    stations,
+    straight_parts,
+    swept_boxes,
+)
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import images, periods
@@ -44,6 +52,8 @@ class _Thing:
         By how much a body is drawn in, and its shortest edges, m.
     rooted : ndarray of bool, shape (n,)
         A body's points that supports hold.
+    slack, radius : float
+        How far a body's straight ways may be from arcs, and its largest distance from its centre, m.
     outside : bool
         Whether it is all but what the surface encloses.
     """
@@ -55,6 +65,8 @@ class _Thing:
     amount: np.ndarray = field(default_factory=lambda: np.zeros(0))
     edge: np.ndarray = field(default_factory=lambda: np.zeros(0))
     rooted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    slack: float = 0.0
+    radius: float = 0.0
     outside: bool = False
 
     def drawn(self, points: np.ndarray) -> np.ndarray:
@@ -110,14 +122,15 @@ class Watch:
         self._n = len(scene.solids)
         bodies, others = np.triu_indices(self._n, 1, len(self._things))
         self._pairs = np.column_stack((bodies, others))
-        self._first = np.array([thing.place.start for thing in self._things if thing.place is not None])
-        self._owner = np.repeat(np.arange(self._n), np.diff(np.append(self._first, len(self._x))))
+        self._first = np.array(
+            [thing.place.start for thing in self._things if thing.place is not None] + [len(self._x)]
+        )
         still = [thing.points for thing in self._things[self._n :]]
         self._still = [np.array([end(x, axis=0) for x in still]).reshape(-1, scene.dim) for end in (np.min, np.max)]
         self.notes: list[str] = []
         self._spared: dict[tuple[int, int], np.ndarray] = {}
         self._roots: list[_Roots] = []
-        for one, other, shift in self._near(self._x):
+        for one, other, shift in self._near(*self._boxes(self._x)):
             self._take_root(one, other, shift)
             if other < self._n:
                 self._take_root(other, one, -shift)
@@ -136,7 +149,11 @@ class Watch:
         """
         first, said = 2.0, ""
         parts: dict[tuple[int, int], list[Way]] = {}
-        for one, other, shift in self._near(x):
+        low, high = self._boxes(x)
+        for one, other, shift in self._near(low, high):
+            b = self._things[other]
+            if b.place is None and not any_within(b.points, b.facets, low[one] + shift, high[one] + shift):
+                continue
             found = self._meeting(one, other, shift, x, parts)
             if found is not None and found.part < first:
                 first, place = found
@@ -153,9 +170,8 @@ class Watch:
 
     # ---- which are near -----------------------------------------------------------------------------------------
 
-    def _near(self, x: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
-        """Yield pairs of things, and by how much the first is moved, whose boxes meet on the way to x."""
-        low, high = self._boxes(x)
+    def _near(self, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
+        """Yield pairs of things, and by how much the first is moved, whose boxes meet."""
         one, other = self._pairs.T
         length = np.where(self._period > 0.0, self._period, 1.0)
         first = np.ceil((low[other] - high[one]) / length)
@@ -170,13 +186,10 @@ class Watch:
 
         Points on arcs about a body's centre leave their chord by less than half of it, up to a half turn.
         """
-        low, high = np.minimum(self._x, x), np.maximum(self._x, x)
-        way = x - self._x
-        count = np.bincount(self._owner)[:, None]
-        apart = way - (np.add.reduceat(way, self._first) / count)[self._owner]
-        bulge = 0.5 * np.sqrt(np.maximum.reduceat(np.sum(apart**2, axis=1), self._first))[:, None]
-        low, high = np.minimum.reduceat(low, self._first) - bulge, np.maximum.reduceat(high, self._first) + bulge
-        return np.concatenate((low, self._still[0])), np.concatenate((high, self._still[1]))
+        low, high, turned = swept_boxes(self._x, x, self._first)
+        bulge = 0.5 * np.sqrt(turned)[:, None]
+        self._turned = turned
+        return np.concatenate((low - bulge, self._still[0])), np.concatenate((high + bulge, self._still[1]))
 
     # ---- whether they meet --------------------------------------------------------------------------------------
 
@@ -197,10 +210,11 @@ class Watch:
         return facets if spared is None else facets[~spared]
 
     def _parts(self, number: int, x: np.ndarray) -> int:
+        """Return how many straight ways a thing needs."""
         thing = self._things[number]
-        if thing.place is None:
+        if thing.place is None or self._turned[number] <= 8.0 * thing.slack * thing.radius:
             return 1
-        return straight_parts(self._x[thing.place], x[thing.place], float(np.median(thing.amount)))
+        return straight_parts(self._x[thing.place], x[thing.place], thing.slack)
 
     def _ways(self, number: int, n: int, x: np.ndarray, known: dict[tuple[int, int], list[Way]]) -> list[Way]:
         """Return the n straight ways of a thing to x, drawn in."""
@@ -260,8 +274,9 @@ def _bodies(scene: Scene, solid: SolidField, x: np.ndarray) -> list[_Thing]:
         place = slice(int(begin), int(end))
         own = facets[owner[facets[:, 0]] == owner[begin]] - begin
         amount = TOUCH * np.minimum(edge[place], cell)
-        name = f"solids.{names[owner[begin]]}"
-        found.append(_Thing(name, own, x[place].copy(), place, amount, edge[place], rooted[place]))
+        radius = float(np.linalg.norm(x[place] - x[place].mean(axis=0), axis=1).max())
+        about = place, amount, edge[place], rooted[place], float(np.median(amount)), radius
+        found.append(_Thing(f"solids.{names[owner[begin]]}", own, x[place].copy(), *about))
     return found
 
 

@@ -47,21 +47,6 @@ class Way(NamedTuple):
     end: np.ndarray
     facets: np.ndarray
 
-    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and upper corner of the box that each facet stays in, shape (m, dim)."""
-        start, end = self.start[self.facets], self.end[self.facets]
-        return np.minimum(start.min(axis=1), end.min(axis=1)), np.maximum(start.max(axis=1), end.max(axis=1))
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of the box that all facets stay in, shape (dim,)."""
-        low, high = self.boxes()
-        return low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
-
-    def within(self, low: np.ndarray, high: np.ndarray) -> Way:
-        """Return the way of the facets that may come into a box."""
-        lows, highs = self.boxes()
-        return self._replace(facets=self.facets[np.all((lows <= high) & (highs >= low), axis=1)])
-
 
 class Meeting(NamedTuple):
     """Where surfaces meet first: the part of the way, 0 to 1, and the place, m."""
@@ -100,18 +85,67 @@ def crossings(one: Way, other: Way) -> tuple[np.ndarray, np.ndarray]:
 
 
 def near_pairs(one: Way, other: Way) -> np.ndarray:
-    """Return the pairs of facets whose boxes meet, one of each surface, shape (k, 2)."""
-    boxes = [np.concatenate(ends) for ends in zip(one.boxes(), other.boxes(), strict=True)]
-    low, high = boxes
-    if not len(one.facets) or not len(other.facets):
-        return np.zeros((0, 2), dtype=np.int64)
-    extent = np.ptp(low, axis=0)
-    axis = int(np.argmin((high - low).mean(axis=0) / np.where(extent > 0.0, extent, 1e-300)))
-    return _near_pairs(low, high, len(one.facets), axis, np.argsort(low[:, axis], kind="stable"))
+    """Return the pairs of facets whose boxes meet on their way, one of each surface, shape (k, 2)."""
+    ends = [[np.ascontiguousarray(x, dtype=float) for x in (way.start, way.end)] for way in (one, other)]
+    return _near_pairs(ends[0][0], ends[0][1], one.facets, ends[1][0], ends[1][1], other.facets)
 
 
 @njit(cache=True)
-def _near_pairs(low, high, n, axis, order):
+def any_within(points, facets, low, high):
+    """Whether the box of any facet meets a box."""
+    for f in facets:
+        meets = True
+        for a in range(points.shape[1]):
+            least = most = points[f[0], a]
+            for i in f[1:]:
+                least, most = min(least, points[i, a]), max(most, points[i, a])
+            meets = meets and least <= high[a] and most >= low[a]
+        if meets:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _near_pairs(start, end, facets, start_b, end_b, facets_b):
+    """Return the pairs of ``near_pairs``: boxes sorted along the axis along which they overlap least."""
+    dim, n = start.shape[1], len(facets)
+    low, high = np.empty((n + len(facets_b), dim)), np.empty((n + len(facets_b), dim))
+    begins, ends = _boxes(start, end, facets, low[:n], high[:n])
+    begins_b, ends_b = _boxes(start_b, end_b, facets_b, low[n:], high[n:])
+    begins, ends = np.maximum(begins, begins_b), np.minimum(ends, ends_b)
+    kept, k = np.empty(len(low), dtype=np.int64), 0
+    for i in range(len(low)):
+        meets = True
+        for a in range(dim):
+            meets = meets and low[i, a] <= ends[a] and high[i, a] >= begins[a]
+        if meets:
+            kept[k] = i
+            k += 1
+    kept = kept[:k]
+    axis, least = 0, np.inf
+    for a in range(dim):
+        crowd = np.sum(high[kept, a] - low[kept, a]) / max(ends[a] - begins[a], 1e-300)
+        if crowd < least:
+            axis, least = a, crowd
+    return _sweep(low, high, n, axis, kept[np.argsort(low[kept, axis])])
+
+
+@njit(cache=True)
+def _boxes(start, end, facets, low, high):
+    """Fill the corners of the box that each facet stays in, and return those of all of them."""
+    begins, ends = np.full(start.shape[1], np.inf), np.full(start.shape[1], -np.inf)
+    for f in range(len(facets)):
+        for a in range(start.shape[1]):
+            low[f, a], high[f, a] = np.inf, -np.inf
+            for i in facets[f]:
+                low[f, a] = min(low[f, a], min(start[i, a], end[i, a]))
+                high[f, a] = max(high[f, a], max(start[i, a], end[i, a]))
+            begins[a], ends[a] = min(begins[a], low[f, a]), max(ends[a], high[f, a])
+    return begins, ends
+
+
+@njit(cache=True)
+def _sweep(low, high, n, axis, order):
     """Return pairs of boxes that meet, one of the first n; ``order`` sorts their low ends along an axis."""
     found, k = np.empty((64, 2), dtype=np.int64), 0
     for a in range(len(order)):

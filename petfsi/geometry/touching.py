@@ -6,11 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from petfsi.geometry.bodies import enclosed
 from petfsi.geometry.collisions import Meeting, Way, first_meeting
 from petfsi.geometry.rays import nearest_on_facets
-from petfsi.geometry.slabs import area_vectors
 from petfsi.geometry.surfaces import ridges
 
 
@@ -26,14 +26,68 @@ def shortest_edges(points: np.ndarray, facets: np.ndarray) -> np.ndarray:
 
 def drawn_in(points: np.ndarray, facets: np.ndarray, amount: np.ndarray) -> np.ndarray:
     """Return points moved into the body by amounts (n,), m: against the mean of the normals of their facets."""
+    return _drawn_in(np.ascontiguousarray(points, dtype=float), facets, amount)
+
+
+@njit(cache=True)
+def _drawn_in(points, facets, amount):
     dim = points.shape[1]
-    area = area_vectors(points, facets)
-    size = np.linalg.norm(area, axis=1, keepdims=True)
-    unit = np.repeat(area / np.where(size > 0.0, size, 1.0), dim, axis=0)
-    corners = facets.ravel()
-    normal = np.column_stack([np.bincount(corners, weights=n, minlength=len(points)) for n in unit.T])
-    length = np.linalg.norm(normal, axis=1)
-    return points - (amount / np.where(length > 0.0, length, 1.0))[:, None] * normal
+    mean, normal = np.zeros(points.shape), np.zeros(dim)
+    for f in facets:
+        a, b = points[f[0]], points[f[1]]
+        if dim == 2:
+            normal[0], normal[1] = b[1] - a[1], a[0] - b[0]
+        else:
+            c = points[f[2]]
+            for k in range(3):
+                i, j = (k + 1) % 3, (k + 2) % 3
+                normal[k] = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
+        length = np.sqrt(np.sum(normal**2))
+        if length > 0.0:
+            for i in f:
+                for k in range(dim):
+                    mean[i, k] += normal[k] / length
+    moved = points.copy()
+    for i in range(len(points)):
+        length = np.sqrt(np.sum(mean[i] ** 2))
+        if length > 0.0:
+            moved[i] -= amount[i] / length * mean[i]
+    return moved
+
+
+@njit(cache=True)
+def swept_boxes(start, end, first):
+    """Return the corners of the box of each body's straight way, and the largest square of how far points turn, m^2.
+
+    Parameters
+    ----------
+    start, end : ndarray, shape (n, dim)
+        m.
+    first : ndarray of int, shape (n_bodies + 1,)
+        Where each body's points begin.
+
+    Returns
+    -------
+    low, high : ndarray, shape (n_bodies, dim)
+    turned : ndarray, shape (n_bodies,)
+        What points move besides their mean.
+    """
+    n, dim = len(first) - 1, start.shape[1]
+    low, high, turned = np.full((n, dim), np.inf), np.full((n, dim), -np.inf), np.zeros(n)
+    mean = np.zeros(dim)
+    for body in range(n):
+        mean[:] = 0.0
+        for i in range(first[body], first[body + 1]):
+            for a in range(dim):
+                low[body, a] = min(low[body, a], min(start[i, a], end[i, a]))
+                high[body, a] = max(high[body, a], max(start[i, a], end[i, a]))
+                mean[a] += (end[i, a] - start[i, a]) / (first[body + 1] - first[body])
+        for i in range(first[body], first[body + 1]):
+            square = 0.0
+            for a in range(dim):
+                square += (end[i, a] - start[i, a] - mean[a]) ** 2
+            turned[body] = max(turned[body], square)
+    return low, high, turned
 
 
 def straight_parts(start: np.ndarray, end: np.ndarray, slack: float) -> int:
@@ -48,8 +102,6 @@ def straight_parts(start: np.ndarray, end: np.ndarray, slack: float) -> int:
     """
     y0, y1 = start - start.mean(axis=0), end - end.mean(axis=0)
     radius = float(np.sqrt(np.max(np.sum(y0**2, axis=1))))
-    if float(np.max(np.sum((y1 - y0) ** 2, axis=1))) <= 8.0 * slack * radius:
-        return 1
     angle = float(np.linalg.norm(_rotation_vector(y0, y1)))
     return max(1, math.ceil(angle * math.sqrt(radius / (8.0 * slack))))
 
@@ -96,10 +148,8 @@ def _turned_by(turn: np.ndarray) -> np.ndarray:
 
 def first_on_ways(one: Sequence[Way], other: Sequence[Way]) -> Meeting | None:
     """Return where two surfaces meet first, each on its straight ways one after the other, in equal times."""
-    for k, (a, b) in enumerate(zip(one, other, strict=True)):
-        a = a.within(*b.bounds())
-        b = b.within(*a.bounds())
-        found = first_meeting(a, b)
+    for k, ways in enumerate(zip(one, other, strict=True)):
+        found = first_meeting(*ways)
         if found is not None:
             return Meeting((k + found.part) / len(one), found.place)
     return None
