@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build, petsc
+from petfsi import build, petsc, start
 from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
@@ -31,6 +31,9 @@ SCALARS = ("pressure", "smoke", "angle", "front", "level")
 #: The solution of a field without unknowns.
 NOTHING = np.zeros(0)
 
+#: A start that changes the kinetic energy by more than this part of it is told of.
+START_NOTED = 1e-3
+
 #: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
 #: is left.
 REPEATS = 6
@@ -47,6 +50,8 @@ class Simulation:
         Into how many the last step was divided: because an explicit scheme needs shorter ones, or a solve failed.
     report : callable
         Is told in a line what a user should know of a step.
+    notes : list of str
+        What a user should know of how it begins, from ``prepare`` on.
     outcome : Outcome
         What the solves of the last step reported.
     volume_error : float
@@ -77,6 +82,7 @@ class Simulation:
         self._retries = 0 if self.stable.limited else scene.time.retries
         self.substeps = 1
         self.report: Callable[[str], None] = lambda text: None
+        self.notes: list[str] = []
         self.regions: ClosedRegions | None = None
         if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
@@ -118,10 +124,9 @@ class Simulation:
         """
         t = self.time
         dt = self.dt = self._length(t)
-        n = self.stable.count(t, dt)
         self.substeps, self.outcome, self.volume_error = 0, Outcome(0, 0.0), 0.0
-        for number in range(n):
-            self._take(t + number * dt / n, dt / n, self._retries)
+        for begin, length in self.stable.parts(t, dt):
+            self._take(begin, length, self._retries)
         self.step += 1
         self.time = self._stepping.after(self.step, t, dt)
 
@@ -176,18 +181,42 @@ class Simulation:
         for field in self.fields:
             field.forget()
 
-    def prepare(self) -> list[str]:
+    def prepare(self, resumes: bool = False) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
 
+        Then let the velocities of fluid and solids fit each other, unless a run ``resumes`` with those of a checkpoint.
         Collective. Returns the options of others that nothing reads.
+
+        Raises
+        ------
+        SolveError
+            On all ranks, if that start cannot be found.
         """
         self.dt = self._length(self.time)
         self.stable.count(self.time, self.dt)
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
         self._assemble(self.time, self.dt)
+        unread = self.solver.check_options()
         self.accounts.start()
-        return self.solver.check_options()
+        if not resumes:
+            self._fit_velocities()
+        return unread
+
+    def _fit_velocities(self) -> None:
+        """Let fluid and solids begin with velocities that fit each other; note what that did. Collective."""
+        if self.regions is None or not isinstance(self.fluid, PressureFluid) or not isinstance(self.solver, Solver):
+            return
+        before = self.accounts.values.get("kinetic", np.nan)
+        if not start.fit_velocities(self.system, self.solver, self.regions, self.fluid, self.solid, self.dt):
+            return
+        self.accounts.start()
+        after = self.accounts.values.get("kinetic", np.nan)
+        if abs(after - before) > START_NOTED * max(before, after):
+            self.notes.append(
+                f"the velocities given at t = 0 did not fit each other, and were brought to the nearest that do: "
+                f"kinetic energy {after:.4g} J, not {before:.4g} J"
+            )
 
     def _assemble(self, t: float, dt: float) -> bool:
         if self.regions:
@@ -260,9 +289,19 @@ class Simulation:
         if not fastest * dt < extent:
             raise SolveError(
                 f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
-                f"in one step of {dt:g} s. A splitting scheme fails like this where the fluid that moves with the "
-                f"solid outweighs it, at small steps most of all: try monolithic.opts. Else more damping, a smaller dt."
+                f"in one step of {dt:g} s. {self._advice()}"
             )
+
+    def _advice(self) -> str:
+        """Return what may help a run that blows up."""
+        if self.solver.decoupled:
+            return (
+                "A splitting scheme fails like this where the fluid that moves with the solid outweighs it, at small "
+                "steps most of all: try monolithic.opts. Else more damping, a smaller dt."
+            )
+        if self.stable.limited or self.solver.iterates:
+            return "Try a smaller dt, or more damping."
+        return "Try a smaller dt, -fsi_snes_type newtonls, or more damping."
 
     def probe_columns(self) -> list[str]:
         """Return the names of the probes' columns in history.csv."""

@@ -65,6 +65,13 @@ class Coupling(ABC):
         """
         return None
 
+    def outflow(self) -> np.ndarray:
+        """Return what solids' walls let out of this rank's unknowns of the fluid at their present velocity. Collective.
+
+        In m^3/s (m^2/s in 2D), through the walls that ``couple`` saw last.
+        """
+        raise NotImplementedError
+
     @abstractmethod
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere, m^3/s (m^2/s in 2D), to the right sides that are assembled."""

@@ -207,6 +207,10 @@ class CutCellCoupling(Coupling):
             self.fluid.cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved
         )
 
+    def outflow(self) -> np.ndarray:
+        """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
+        return self._point_flux @ self.solid.surface_velocity().ravel()
+
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the right sides. Collective."""
         self.fluid.rhs += self._pressed(volume)

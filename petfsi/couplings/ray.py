@@ -229,6 +229,10 @@ class RayCoupling(Coupling):
             self._held_outflow = self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
             self.fluid.rhs -= self._held_outflow
 
+    def outflow(self) -> np.ndarray:
+        """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
+        return self._point_flux @ self.solid.surface_velocity().ravel()
+
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the fluid's right side."""
         self.fluid.rhs += volume

@@ -317,6 +317,14 @@ class PressureFluid(FluidField):
         """Return by unknown what the step lets in through sides with a given velocity; None if there are none."""
 
     @abstractmethod
+    def net_outflow(self) -> np.ndarray:
+        """Return by unknown what leaves it at the present velocity but through solids' walls, m^3/s (m^2/s in 2D)."""
+
+    @abstractmethod
+    def push(self, x: np.ndarray, dt: float) -> None:
+        """Change the present velocity as the pressure x (SI) would in a first step of dt. Collective."""
+
+    @abstractmethod
     def cells_slab(self, values: np.ndarray) -> Slab:
         """Return a value per lasting unknown, shape (n_cells,), as a piece of a global array."""
 
@@ -427,6 +435,10 @@ class SolidField(Field):
 
         Shape (n_points, dim), on every rank.
         """
+
+    @abstractmethod
+    def push(self, change: np.ndarray) -> None:
+        """Change the present velocities by this much (SI, by unknown)."""
 
     @abstractmethod
     def landing(self, dt: float) -> Landing:

@@ -148,6 +148,11 @@ class JointSolid(SolidField):
             part.accept(mine, time, dt)
         self.moved = np.concatenate([part.moved for part in self.parts])
 
+    def push(self, change: np.ndarray) -> None:
+        """Change the velocities of every part by its share."""
+        for part, mine in self._split(change):
+            part.push(mine)
+
     def rewind(self) -> None:
         """Forget the step begun, in every part."""
         for part in self.parts:

@@ -103,6 +103,7 @@ class MacFluid(CoveredGrid):
             self.smoke[self.cell_kind != kinds.FLUID] = 0.0
             self._complete_cells(self.smoke)
         self._transport.carried = self._extend(self.velocity)
+        self.velocity_star = each(np.copy, self.velocity)
         if self.sheets is not None:
             whole = self._sheets_of(Parts.none())
             self._go_on(Lineage(self.grid, whole, self.sheets, self.face_kind))
@@ -279,6 +280,19 @@ class MacFluid(CoveredGrid):
         if self.source is not None:
             self.rhs += self.source
 
+    def net_outflow(self) -> np.ndarray:
+        """Return by unknown what leaves it at the present velocity but through solids' walls."""
+        return self._outflow(self.velocity)
+
+    def push(self, x: np.ndarray, dt: float) -> None:
+        """Change the present velocity as the pressure x would in a first step of dt. Collective."""
+        p = self.grid.zeros_cells()
+        self.grid.from_vec(x[: self.grid.layout.n_local], p)
+        self.grid.exchange_cells(p)
+        self.velocity_star = each(np.copy, self.velocity)
+        self.velocity = self._projected(p, x, self._transport.factor(dt))
+        self._transport.carried = self._extend(self.velocity)
+
     def inflow(self) -> np.ndarray | None:
         """Return by unknown what jets let in, m^3/s (m^2/s in 2D); None if there are none. Not collective."""
         if not self.surroundings.has_jets:
@@ -300,32 +314,12 @@ class MacFluid(CoveredGrid):
 
         Smoke has moved in ``predict`` already; here cells that are fluid only now get the mean of their neighbours.
         """
-        grid, factor = self.grid, self._transport.factor(dt)
-        n_cells = grid.layout.n_local
-        grid.from_vec(x[:n_cells], self.pressure)
+        grid = self.grid
+        grid.from_vec(x[: grid.layout.n_local], self.pressure)
         grid.exchange_cells(self.pressure)
-        solved = Faces(np.zeros_like(v) for v in self.velocity)
-        for axis in self._axes:
-            pressure.project(
-                self.velocity_star[axis],
-                self.pressure,
-                self.boundary_velocity[axis],
-                self.face_kind[axis],
-                kinds.STEP[axis],
-                factor / (self.density * grid.dx[axis]),
-                self._part(axis),
-                solved[axis],
-            )
+        solved = self._projected(self.pressure, x, self._transport.factor(dt))
         if self.extras is not None:
-            self._extra_pressure = x[n_cells:].copy()
-            assert self.sheets is not None
-            local, extras = self.sheets.local, self.extras
-            parts = extras.project(
-                self.velocity_star.parts, self._extra_pressure, self.layout.start + n_cells, self.pressure,
-                self.index, factor / (self.density * grid.dx), self.comm,
-            )  # fmt: skip
-            solved.parts = local.gathered(parts, extras.row[extras.owned])
-            local.mean_into(solved, solved.parts)
+            self._extra_pressure = x[grid.layout.n_local :].copy()
         if self.weight is not None:
             rest = self.weight.pressure()
             self.pressure += np.where(self._active, rest, 0.0)
@@ -336,6 +330,42 @@ class MacFluid(CoveredGrid):
         self.velocity = self._transport.accept(solved, self.face_kind, dt, self._extend)
         if self.smoke is not None:
             self._complete_cells(self.smoke)
+
+    def _projected(self, p: np.ndarray, x: np.ndarray, factor: float) -> Faces:
+        """Return v_w = v* - (factor/rho) G p on owned faces, see ``transport``. Collective.
+
+        Parameters
+        ----------
+        p : ndarray
+            Pressure, Pa, a cell array with its ghosts.
+        x : ndarray
+            The same by unknown, with further pieces' at the end.
+        factor : float
+            s.
+        """
+        grid, star = self.grid, self.velocity_star
+        solved = Faces(np.zeros_like(v) for v in self.velocity)
+        for axis in self._axes:
+            pressure.project(
+                star[axis],
+                p,
+                self.boundary_velocity[axis],
+                self.face_kind[axis],
+                kinds.STEP[axis],
+                factor / (self.density * grid.dx[axis]),
+                self._part(axis),
+                solved[axis],
+            )
+        if self.extras is not None:
+            assert self.sheets is not None
+            local, extras, n_cells = self.sheets.local, self.extras, grid.layout.n_local
+            parts = extras.project(
+                star.parts, x[n_cells:], self.layout.start + n_cells, p, self.index,
+                factor / (self.density * grid.dx), self.comm,
+            )  # fmt: skip
+            solved.parts = local.gathered(parts, extras.row[extras.owned])
+            local.mean_into(solved, solved.parts)
+        return solved
 
     def _remember_extras(self) -> None:
         """Keep the pressure of the second piece of split cells where the next step's cells can find it."""

@@ -332,6 +332,10 @@ class NodalSolid(SolidField):
         self._stage = relinearised(stage, x.reshape(-1, self.width))
         return True
 
+    def push(self, change: np.ndarray) -> None:
+        """Change the present velocities by this much."""
+        self.velocity = self.velocity + change.reshape(-1, self.width)
+
     def rewind(self) -> None:
         """Forget the step begun."""
         self._stage = self._geometry = None
