@@ -17,3 +17,7 @@ class SolveError(PetfsiError):
     """A solve failed or the state blew up: exit code 3."""
 
     exit_code = 3
+
+
+class TouchError(SolveError):
+    """Things meet that do not push each other off: no shorter step helps."""

@@ -7,6 +7,7 @@ import signal
 import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -335,7 +336,8 @@ def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
-    for note in [*(simulation.fluid.notes if simulation.fluid else []), *simulation.notes]:
+    told = [part.notes for part in (simulation.fluid, simulation.watch) if part is not None]
+    for note in [*chain.from_iterable(told), *simulation.notes]:
         console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")

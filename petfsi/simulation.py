@@ -13,7 +13,7 @@ from petfsi import build, petsc, start
 from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
-from petfsi.errors import SolveError
+from petfsi.errors import SolveError, TouchError
 from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
 from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
@@ -22,6 +22,7 @@ from petfsi.scene.stepping import Stepping
 from petfsi.solve import Outcome, Solver
 from petfsi.substeps import StableStep
 from petfsi.system import System
+from petfsi.touch import watch
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
 
@@ -88,6 +89,7 @@ class Simulation:
         self.regions: ClosedRegions | None = None
         if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
+        self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.guard = EnergyGuard(comm, scene)
         self.outcome = Outcome(0, 0.0)
@@ -144,7 +146,7 @@ class Simulation:
         try:
             self._attempt(t, dt)
         except SolveError as error:
-            if retries == 0:
+            if retries == 0 or isinstance(error, TouchError):
                 raise
             why = str(error).split(": ")[0]
             self.report(f"t = {t:.6g} s: the step of {dt:g} s is taken again as two halves: {why}")
@@ -269,6 +271,8 @@ class Simulation:
         if self.solid:
             self._check_speed(self.solid, values["solid"], dt)
             self.solid.judge(values["solid"], dt)
+            if self.watch:
+                self.watch.judge(self.solid.surface_arrival(values["solid"], dt), t, dt)
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
             coupling.accept(values, t, dt)
@@ -374,6 +378,8 @@ class Simulation:
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
+        if self.solid and self.watch:
+            self.watch.resume(self.solid)
         for coupling in self.couplings:
             coupling.restored()
         if self.regions:

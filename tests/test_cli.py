@@ -73,7 +73,7 @@ def petfsi(*args, ranks=0, code=None, **variables):
     """Run petfsi, or a piece of Python, as a user does: in a process of its own."""
     what = ["-c", code] if code else ["-m", "petfsi.cli"]
     command = [*launcher(ranks), sys.executable, *what, *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment(**variables), timeout=60)
+    return subprocess.run(command, capture_output=True, text=True, env=environment(**variables), timeout=180)
 
 
 # ---- what is passed on --------------------------------------------------------------------------------------

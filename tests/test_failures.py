@@ -71,7 +71,7 @@ def petfsi(*words, ranks=1, file_limit=None):
         code += f"resource.setrlimit(resource.RLIMIT_FSIZE, ({file_limit},) * 2); sys.exit(cli.main(sys.argv[1:]))"
         command = [sys.executable, "-c", code]
     line = [*launcher(ranks), *command, *map(str, words)]
-    return subprocess.run(line, capture_output=True, text=True, env=environment(), timeout=60)
+    return subprocess.run(line, capture_output=True, text=True, env=environment(), timeout=180)
 
 
 @pytest.fixture
@@ -562,7 +562,7 @@ def test_a_damaged_history_is_named(run, here):
 
 def wait_for(path, rows, process):
     """Return once a history has so many rows."""
-    limit = time.monotonic() + 30
+    limit = time.monotonic() + 120
     while not (path.exists() and len(path.read_text().splitlines()) > rows):
         assert process.poll() is None and time.monotonic() < limit
         time.sleep(0.02)
@@ -577,7 +577,7 @@ def test_a_signal_stops_the_run_and_resuming_finishes_it_alike(scene, number, ra
     ) as process:
         wait_for(Path("out/history.csv"), 20, process)
         process.send_signal(number)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=120)
     assert process.returncode == 75, err
     stopped = json.loads(Path("out/summary.json").read_text())
     step = stopped["steps"]
@@ -636,6 +636,6 @@ def test_a_log_of_mpirun_has_no_escape_codes(scene):
 
 def test_a_reader_who_leaves_does_not_end_the_run(scene):
     line = f"{PETFSI} run {scene} --out out | head -n 1; exit ${{PIPESTATUS[0]}}"
-    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment(), timeout=60)
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment(), timeout=180)
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(Path("out/summary.json").read_text())["status"] == "done"

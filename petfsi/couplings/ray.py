@@ -241,10 +241,10 @@ class RayCoupling(Coupling):
         """Make the operators anew, and the fluid's cells with them, in the next step."""
         self._positions = None
 
-    def work(self, pressure: np.ndarray, dt: float) -> Work:
+    def power(self, pressure: np.ndarray) -> Work:
         """Return what supports do against the pressure, as the fluid feels it."""
         held = self._held_outflow
-        return Work(boundary=-dt * float(pressure @ held) if len(held) else 0.0)
+        return Work(boundary=-float(pressure @ held) if len(held) else 0.0)
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give the faces that the solid took its new velocity, in ghosts, too."""

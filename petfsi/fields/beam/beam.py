@@ -183,6 +183,14 @@ class BeamSolid(NodalSolid):
         indptr = np.concatenate(([0], np.cumsum(chosen.sum(axis=1)))).astype(IntType)
         return csr_matrix((values[chosen], self._columns[chosen], indptr), shape=(len(chosen), self.layout.n_global))
 
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points."""
+        return np.repeat(self._node_body, 2)
+
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points are at nodes that supports hold where they are, whether these turn or not."""
+        return np.repeat(self._still_nodes(), 2)
+
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, 2). Collective.
 

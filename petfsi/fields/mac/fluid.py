@@ -461,8 +461,8 @@ class MacFluid(CoveredGrid):
             self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
         return -inflow[unknowns]
 
-    def work(self, dt: float) -> Work:
-        """Return this rank's share of what was done in the step last accepted, see ``budget``."""
+    def power(self) -> Work:
+        """Return this rank's share of the power of gravity and of what comes through sides, see ``budget``."""
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
         gravity = 0.0
         if self._forces is not None:
@@ -471,12 +471,12 @@ class MacFluid(CoveredGrid):
                 local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
                 now = None if local is None else local.at_cells(forces.smoke, self.smoke_parts)
                 forces = replace(forces, link_smoke=now)
-            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
+            gravity = budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
         into = budget.inflow(
             self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.extras,
             self._extra_pressure,
         )  # fmt: skip
-        return Work(gravity=gravity, boundary=dt * into)
+        return Work(gravity=gravity, boundary=into)
 
     def cells_slab(self, values: np.ndarray) -> Slab:
         """Return a value per cell, in the DMDA's order, as a piece of a global array."""

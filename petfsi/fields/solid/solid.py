@@ -78,6 +78,7 @@ class SimplexSolid(NodalSolid):
         hollow = np.array([solid.interior == "void" for solid in solids.values()])
         nodes, facets = np.unique(facets, return_inverse=True)
         facets = facets.reshape(-1, self.dim)
+        self._surface_nodes = nodes
         if curved is not None:
             curved = curved._replace(nodes=np.searchsorted(nodes, curved.nodes))
         unknowns = (self.dim * number[nodes].astype(np.int64)[:, None] + np.arange(self.dim)).ravel()
@@ -129,6 +130,14 @@ class SimplexSolid(NodalSolid):
     def surface(self) -> Surface:
         """Return the boundary of all bodies, the same on every rank."""
         return self._surface
+
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points."""
+        return self._node_body[self._surface_nodes]
+
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points supports hold where they are, along all axes."""
+        return self._still_nodes()[self._surface_nodes]
 
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, dim). Collective.
