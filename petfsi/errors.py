@@ -17,3 +17,7 @@ class SolveError(PetfsiError):
     """A solve failed or the state blew up: exit code 3."""
 
     exit_code = 3
+
+
+class NoSolutionError(SolveError):
+    """The equations of a step have no solution, whatever its length: it is not tried again."""

@@ -119,6 +119,11 @@ class JointSolid(SolidField):
         for part in self.parts:
             part.predict(time, dt)
 
+    def predicted(self) -> float:
+        """Return how far off the farthest of this rank's nodes is where the step's equations are taken, m."""
+        # what is no number counts most
+        return float(np.max([part.predicted() for part in self.parts]))
+
     def assemble(self, time: float, dt: float) -> None:
         """Refresh block (only if that of a part has changed) and right-hand side. Collective."""
         for part in self.parts:
@@ -184,6 +189,10 @@ class JointSolid(SolidField):
         """Length of the shortest edge of any part at rest, m. Collective at first."""
         return min(part.finest for part in self.parts)
 
+    def unheld(self) -> list[str]:
+        """Return what is wrong with bodies that nothing holds in statics. Collective."""
+        return [text for part in self.parts for text in part.unheld()]
+
     def stable_step(self) -> float:
         """Return the shortest of the parts' stable steps, s. Collective."""
         return min(part.stable_step() for part in self.parts)
@@ -244,6 +253,11 @@ class JointSolid(SolidField):
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, dim). Collective."""
         return np.concatenate([part.surface_positions() for part in self.parts])
+
+    def surface_bodies(self) -> np.ndarray:
+        """Return which body each point of the surface belongs to."""
+        numbers = [np.array([self.names.index(name) for name in part.names]) for part in self.parts]
+        return np.concatenate([n[part.surface_bodies()] for n, part in zip(numbers, self.parts, strict=True)])
 
     def surface_present(self) -> np.ndarray:
         """Return the present positions of its points, shape (n_points, dim). Collective."""

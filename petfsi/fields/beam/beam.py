@@ -74,6 +74,10 @@ class BeamSolid(NodalSolid):
         theory = next(iter(self._beams.values())).theory
         return BeamElements(self._mesh.points, self._mesh.cells, self._mesh.body, self._sections(solids), theory)
 
+    def _stiffens(self, body: int) -> bool:
+        """Return whether its theory knows of turning."""
+        return self._mesh.cells.shape[1] > 2
+
     def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the axis' segments between nodes, of beams that may turn as far as they like, and EA/2.
 
@@ -198,6 +202,10 @@ class BeamSolid(NodalSolid):
     def surface_arrival(self, x: np.ndarray | None, dt: float) -> np.ndarray:
         """Return where its points are after a step of dt with the solution x (None: zero). Collective."""
         return self._outline(self._everywhere(self._destination(x, dt)))
+
+    def surface_bodies(self) -> np.ndarray:
+        """Return which beam each point of the surface belongs to: two to every node."""
+        return np.repeat(self._node_body, 2)
 
     def surface_present(self) -> np.ndarray:
         """Return the present positions of its points, shape (n_points, 2). Collective."""

@@ -50,6 +50,10 @@ class SimplexSolid(NodalSolid):
         self._turns = np.array([solid.material != "linear" for solid in solids.values()])
         return Elements(self._mesh, _bodies(solids))
 
+    def _stiffens(self, body: int) -> bool:
+        """Return whether its material knows of turning."""
+        return bool(self._turns[body])
+
     def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the cells of bodies whose material does not mind being turned, and 2 (lambda + mu)."""
         use = self._turns[self._mesh.body]
@@ -82,6 +86,7 @@ class SimplexSolid(NodalSolid):
             curved = curved._replace(nodes=np.searchsorted(nodes, curved.nodes))
         unknowns = (self.dim * number[nodes].astype(np.int64)[:, None] + np.arange(self.dim)).ravel()
         fixed = np.isin(unknowns, self._supports.unknowns)
+        self._surface_body = node_body[nodes]
         # the surface's points are gathered rank after rank; this is where each belongs
         self._gathered = np.argsort(number[nodes])
         self._wet = number[nodes][self._gathered] - self._mesh.nodes.start
@@ -146,6 +151,10 @@ class SimplexSolid(NodalSolid):
         """Return where the surface's points are if this rank's nodes on it are at ``wet``. Collective."""
         nodes = self._gather_surface(wet)
         return nodes if self._surface.curved is None else self._surface.curved.vertices(nodes)
+
+    def surface_bodies(self) -> np.ndarray:
+        """Return which body each point of the surface belongs to."""
+        return self._surface_body
 
     def surface_present(self) -> np.ndarray:
         """Return the present positions of its points, shape (n_points, dim). Collective."""
