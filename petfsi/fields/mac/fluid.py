@@ -299,6 +299,38 @@ class MacFluid(CoveredGrid):
             return None
         return -self._outflow(each(np.zeros_like, self.velocity_star))
 
+    def inflows(self) -> dict[str, np.ndarray]:
+        """Return by unknown what each side with jets lets in. Not collective."""
+        found: dict[str, np.ndarray] = {}
+        given, still = self.boundary_velocity, each(np.zeros_like, self.velocity_star)
+        for key in self.surroundings.jet_keys:
+            self.boundary_velocity = [np.zeros_like(v) for v in given]
+            self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity, key)
+            found[key] = -self._outflow(still)
+        self.boundary_velocity = given
+        return found
+
+    def rehearse(self, time: float, dt: float) -> None:
+        """Give jets the velocities that they have in a step from ``time``. Collective."""
+        self.surroundings.evaluate(time + self._transport.moment(dt))
+        self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
+
+    def place(self, member: np.ndarray) -> str:
+        """Return the box around the cells of some unknowns. Collective."""
+        cells, shape = member[: self.n_cells] != 0.0, self.grid.shape(None)
+        ends = np.full((2, self.dim), -np.inf)
+        for a in self._axes:
+            centres = np.broadcast_to(self.grid.coordinates(None)[a], shape)
+            x = self.grid.to_vec(centres)[cells]
+            if self.extras is not None:
+                x = np.append(x, centres.reshape(-1)[self.extras.cell][member[self.n_cells :] != 0.0])
+            if len(x):
+                ends[:, a] = self.grid.dx[a] / 2 + np.array([x.max(), -x.min()])
+        high, low = self.comm.allreduce(ends, op=np.maximum)
+        return (
+            ", ".join(f"{axis} {0.0 - b:.4g} to {e:.4g}" for axis, b, e in zip("xyz", low, high, strict=False)) + " m"
+        )
+
     def rhs_round_off(self) -> float:
         """Return eps ||A v*||: net outflows are differences of what goes in and out. Collective."""
         stars = [star[self.grid.owned(axis)] for axis, star in enumerate(self.velocity_star)]

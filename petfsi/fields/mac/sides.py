@@ -99,6 +99,8 @@ class Surroundings:
         Face arrays: OPEN or WALL for faces on the sides.
     jets : list of Jet
         Those that this rank sees.
+    jet_keys : list of str
+        Of the sides with any, on every rank.
     has_jets : bool
         Whether any rank sees any.
     behind_jets : ndarray of bool
@@ -111,7 +113,13 @@ class Surroundings:
         self.cell_kind[grid.inside(None)] = kinds.FLUID
         self.side_kind = [np.full(grid.shape(axis), kinds.WALL, dtype=np.uint8) for axis in range(grid.dim)]
         self.jets: list[Jet] = []
-        self.has_jets = any(isinstance(getattr(sides, name), GridInflowSide) for pair in NAMES for name in pair)
+        self.jet_keys = [
+            f"fluid.sides.{name}.inflow"
+            for p in NAMES
+            for name in p
+            if isinstance(getattr(sides, name), GridInflowSide)
+        ]
+        self.has_jets = bool(self.jet_keys)
         for axis in range(grid.dim):
             for upper, name in enumerate(NAMES[axis]):
                 if not grid.periodic[axis]:
@@ -164,9 +172,13 @@ class Surroundings:
             velocity[kind == kinds.WALL] = 0.0
         self.prescribe_jets(face_kind, boundary_velocity)
 
-    def prescribe_jets(self, face_kind: list[np.ndarray], boundary_velocity: list[np.ndarray]) -> None:
-        """Write the jets' velocities where their faces are WALL (and not covered by a solid)."""
+    def prescribe_jets(
+        self, face_kind: list[np.ndarray], boundary_velocity: list[np.ndarray], key: str | None = None
+    ) -> None:
+        """Write the velocities of jets, or of those with a key, where their faces are WALL (not covered by a solid)."""
         for jet in self.jets:
+            if key not in (None, jet.key):
+                continue
             wall = face_kind[jet.axis][jet.faces] == kinds.WALL
             boundary_velocity[jet.axis][tuple(i[wall] for i in jet.faces)] = jet.value[wall]
 
