@@ -25,6 +25,7 @@ from petfsi.ranks import agreed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression, evaluate_at
 from petfsi.scene.schema import Scene
+from petfsi.scene.side_notes import side_notes
 from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class MacFluid(CoveredGrid):
         self._extra_pressure = np.zeros(0)
         self._other_pressure: np.ndarray | None = None
         self._forces: budget.Forces | None = None
+        self._weighed = True  # no step has pushed anything yet
         self._bands = [Band(grid, axis) for axis in self._axes]
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
@@ -222,15 +224,18 @@ class MacFluid(CoveredGrid):
         self._remember("smoke", "_extra_pressure", "velocity", "smoke_parts", "sheets")
         transport = self._transport
         transport.remember()
-        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         moment, smoke, further = transport.moment(dt), self.smoke, self.smoke_parts
+        self.surroundings.evaluate(time + moment)
+        if self.surroundings.carries_along:
+            for faces in transport.read():
+                self.surroundings.fill_along(faces)
+        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         if self.smoke is not None and self._smoke_band is not None:
             old, parts = self.smoke, self.smoke_parts
             self.smoke, self.smoke_parts = transport.carry_smoke(old, parts, self._smoke_band.layer != FAR, dt)
             self._complete_cells(self.smoke)
             smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
             further = self.smoke_parts if moment == dt else parts + moment / dt * (self.smoke_parts - parts)
-        self.surroundings.evaluate(time + moment)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         self._add_forces(time + moment, transport.factor(dt), smoke, further)
 
@@ -245,6 +250,8 @@ class MacFluid(CoveredGrid):
         heavy = [self.weight is None or p for p in self.grid.periodic]
         self._forces = forces = budget.Forces.of(gravity, heavy, buoyancy, smoke, link_smoke)
         before = None if local is None else local.at_faces(self.velocity_star)
+        self.open_sides.evaluate(time, gravity)
+        self.open_sides.push(self.velocity_star, self.face_kind, duration)
         if self.weight is not None:
             self.weight.at(time)
             self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
@@ -267,6 +274,7 @@ class MacFluid(CoveredGrid):
                 self._part(axis),
             )
             self.grid.exchange_faces(axis, star, width=1)
+        self._weighed = not self.open_sides.total
 
     def assemble(self, time: float, dt: float) -> None:
         """Refresh L if the geometry or the step changed, the right-hand side and the scales. Collective."""
@@ -274,6 +282,11 @@ class MacFluid(CoveredGrid):
         dx = grid.cell_volume ** (1.0 / self.dim)
         self.row_scale, self.col_scale = 1.0 / dx ** (self.dim - 1), self.density * dx / dt
         factor = self.factor(dt)
+        if not self._weighed:  # the cells are cut as this step sees them by now
+            table = None if self.sheets is None else self.sheets.table
+            carried = self._transport.carried
+            self.open_sides.weigh(carried, self.velocity_star, self.face_kind, factor, table)
+            self._weighed, self._assembled_for = True, None
         if self._assembled_for != (self.geometry_version, factor):
             self._assemble_block(factor)
         self.rhs[:] = -self._outflow(self.velocity_star)
@@ -388,12 +401,14 @@ class MacFluid(CoveredGrid):
                 self._part(axis),
                 solved[axis],
             )
+        if self.open_sides.total:
+            self.open_sides.relax(solved, star, self.face_kind)
         if self.extras is not None:
             assert self.sheets is not None
             local, extras, n_cells = self.sheets.local, self.extras, grid.layout.n_local
             parts = extras.project(
                 star.parts, x[n_cells:], self.layout.start + n_cells, p, self.index,
-                factor / (self.density * grid.dx), self.comm,
+                factor / (self.density * grid.dx), self.comm, self.open_sides.link_yields,
             )  # fmt: skip
             solved.parts = local.gathered(parts, extras.row[extras.owned])
             local.mean_into(solved, solved.parts)
@@ -423,6 +438,8 @@ class MacFluid(CoveredGrid):
             self.grid.fill_sides(known, axis)
             extended.append(known)
         new = Faces(extended, faces.parts)
+        if self.surroundings.carries_along:
+            self.surroundings.fill_along(new)
         if self.sheets is None or not self.sheets.anywhere:
             return new
         # a band takes both sides; and what is narrow now may be read as it is in the next step
@@ -438,6 +455,11 @@ class MacFluid(CoveredGrid):
         self.surroundings.fill_smoke(smoke)
 
     # ---- observation ------------------------------------------------------------------------------------------
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of the sides."""
+        return side_notes(self.scene)
 
     def cfl(self, dt: float) -> float:
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
@@ -505,8 +527,8 @@ class MacFluid(CoveredGrid):
                 forces = replace(forces, link_smoke=now)
             gravity = budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
         into = budget.inflow(
-            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.extras,
-            self._extra_pressure,
+            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.surroundings,
+            self.open_sides, self.extras, self._extra_pressure,
         )  # fmt: skip
         return Work(gravity=gravity, boundary=into)
 
