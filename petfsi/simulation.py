@@ -16,6 +16,7 @@ from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
 from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
+from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
@@ -61,6 +62,8 @@ class Simulation:
     volume_error : float
         Largest relative change of a closed region's fluid volume in a (sub-)step, |sum of net outflows| h / V.
         A split solve spreads a compatible correction over the region: then this is its size.
+    guard : EnergyGuard
+        Stops a run whose energy grows out of nothing.
     accounts : Accounts
         Momentum, energy and volumes, from ``prepare`` on.
     phases : dict
@@ -92,6 +95,7 @@ class Simulation:
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
         self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
+        self.guard = EnergyGuard(comm, scene)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
@@ -131,6 +135,7 @@ class Simulation:
         self.substeps, self.outcome, self.volume_error = 0, Outcome(0, 0.0), 0.0
         for begin, length in self.stable.parts(t, dt):
             self._take(begin, length, self._retries)
+        self.guard.judge(self.accounts.values, self._advice())
         self.step += 1
         self.time = self._stepping.after(self.step, t, dt)
 
@@ -411,6 +416,8 @@ class Simulation:
             states["regions"] = self.regions.state()
         if self.accounts.columns:
             states["accounts"] = self.accounts.state()
+        if self.accounts.columns:
+            states["guard"] = self.guard.state()
         if self.stable.limited:
             states["stable"] = self.stable.state(self.comm)
         return states
@@ -435,5 +442,7 @@ class Simulation:
             self.regions.restore(group("regions"))
         if self.accounts.columns:
             self.accounts.restore(group("accounts"))
+        if self.accounts.columns:
+            self.guard.restore(group("guard"))
         if self.stable.limited:
             self.stable.restore(group("stable"))

@@ -533,7 +533,13 @@ def test_what_cannot_be_resumed_is_refused(run, here, tmp_path):
 
     refused("resume", tmp_path, said="is not the directory of a run")
     refused("resume", tmp_path / "nowhere", said="nowhere is not the directory of a run")
-    refused("resume", run, "--set", "fluid.density=3", said="only time.end, output, checkpoint may be changed")
+    refused(
+        "resume",
+        run,
+        "--set",
+        "fluid.density=3",
+        said="only time.end, time.energy_limit, output, checkpoint may be changed",
+    )
     refused("resume", run, "--set", "time.end=-1", said="time.end = -1: must be greater than 0")
     refused("run", run / "scene.toml", "--out", run, said="holds a run already; continue it with 'petfsi resume")
     refused("resume", run, "-fsi_ksp_typo", "cg", said="did you mean -fsi_ksp_type?")

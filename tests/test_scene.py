@@ -206,6 +206,7 @@ BROKEN = [
     (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'velocity', 'angle', 'pressure', "),
     (["time.above_limit=ignore"], 'time.above_limit = "ignore"', "must be 'refuse' or 'subcycle'"),
     (["time.retries=-1"], "time.retries = -1", "must be 0 or more"),
+    (["time.energy_limit=-2"], "time.energy_limit = -2", "must be 0 or more, or -1"),
     (["time.retries=21"], "time.retries = 21", "must be 20 or less"),
     (["time.integrator=static", "solids.layer.initial={}"], 'time.integrator = "static"', "take out the [fluid]"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
@@ -727,7 +728,9 @@ def test_a_resumed_run_may_change_when_it_ends_and_what_it_writes(tmp_path):
     scene = load_scene(path, ["time.end=3.0", "output.every=0.1", "checkpoint.keep=1"], only=RESUMABLE)
     assert (scene.time.end, scene.output.every, scene.checkpoint.keep) == (3.0, 0.1, 1)
     for setting in ("time.dt=0.1", "time={}", "outputs.every=1", "solids.layer.young=1"):
-        with pytest.raises(InputError, match="here only time.end, output, checkpoint may be changed"):
+        with pytest.raises(
+            InputError, match="here only time.end, time.energy_limit, output, checkpoint may be changed"
+        ):
             load_scene(path, [setting], only=RESUMABLE)
 
 
