@@ -186,6 +186,12 @@ class Simulation:
 
         Collective. Returns the options of others that nothing reads.
         """
+        self.rehearse()
+        self.accounts.start()
+        return self.solver.check_options()
+
+    def rehearse(self) -> None:
+        """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
         self.dt = self._length(self.time)
         self._check_start()
         self.stable.count(self.time, self.dt)
@@ -194,8 +200,6 @@ class Simulation:
         self._assemble(self.time, self.dt)
         with np.errstate(all="ignore"):  # what overflows is found by those who judge the solve
             self._check_equations()
-        self.accounts.start()
-        return self.solver.check_options()
 
     def _check_equations(self) -> None:
         """Refuse a scene whose first step has no solution: before anything is written. Collective."""
