@@ -204,6 +204,15 @@ class Simulation:
         SolveError
             On all ranks, if that start cannot be found.
         """
+        self.rehearse()
+        unread = self.solver.check_options()
+        self.accounts.start()
+        if not resumes:
+            self._fit_velocities()
+        return unread
+
+    def rehearse(self) -> None:
+        """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
         self.dt = self._length(self.time)
         self._check_start()
         self.stable.count(self.time, self.dt)
@@ -212,11 +221,6 @@ class Simulation:
         self._assemble(self.time, self.dt)
         with np.errstate(all="ignore"):  # what overflows is found by those who judge the solve
             self._check_equations()
-        unread = self.solver.check_options()
-        self.accounts.start()
-        if not resumes:
-            self._fit_velocities()
-        return unread
 
     def _fit_velocities(self) -> None:
         """Let fluid and solids begin with velocities that fit each other; note what that did. Collective."""

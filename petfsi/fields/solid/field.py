@@ -371,11 +371,13 @@ class NodalSolid(SolidField):
         )
         force[held] = 0.0
         found: dict[int, list[tuple[RigidMotion, float]]] = {}
+        wrong = []
         for motion in loose_motions(mesh, mesh.points + d, held):
             push, steadies = self._pushed(motion, force[motion.nodes])
+            found.setdefault(motion.body, []).append((motion, push))
             if push or not steadies:
-                found.setdefault(motion.body, []).append((motion, push))
-        return [refusal(self.names[body], motions, self.dim) for body, motions in found.items()]
+                wrong.append(motion.body)
+        return [refusal(self.names[body], found[body], self.dim) for body in dict.fromkeys(wrong)]
 
     def _pushed(self, motion: RigidMotion, force: np.ndarray) -> tuple[float, bool]:
         """Return the work of nodal forces (n, width) along a motion, and whether they hold the body as it turns."""
