@@ -63,9 +63,6 @@ def fluid_skipped(scene: Scene) -> list[str]:
 def _mac(scene: Scene) -> FluidPlan:
     fluid, dim = scene.fluid, scene.dim
     assert isinstance(fluid, MacFluid)
-    from petfsi.geometry.openings import check_jets
-
-    check_jets(fluid, dim)
     n = math.prod(fluid.cells)
     rows = [("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, fluid.cells))}")]
     rows += [("note", note) for note in side_notes(scene)]

@@ -77,6 +77,26 @@ def test_the_power_of_a_jet_is_that_of_its_own_speed():
         assert sim.accounts.values["energy_residual"] == pytest.approx(-power * sim.time, rel=1e-10)
 
 
+@pytest.mark.parametrize("height", [0.55, 0.502, 0.58])
+def test_a_jet_that_ends_at_a_sheet_within_a_cell_stays_on_its_side(height):
+    """It feeds the water above alone, which goes on as a plug; that below stays at rest."""
+    region = {"box": {"origin": [-0.1, height + 0.005], "size": [0.2, 1.0]}}
+    sides = {"left": {"inflow": {"speed": 1.0, "region": region, "smoke": 1.0}}, "right": "open"}
+    walls = {"sheet": box([-1.0, height], [4.0, 0.01])}
+    start = {"smoke": {}}
+    with running(scene((8, 8), sides, "newmark", dt=0.05, obstacles=walls, fluid=start)) as sim:
+        for _ in range(6):
+            sim.advance()
+        fluid, y = sim.fluid, (np.arange(8) + 0.5) / 8
+        plain = np.abs(y - height) > 1 / 16 + 0.01
+        still = np.where(y > height, 1.0, 0.0)
+        assert np.abs(own(fluid, 0)[:, plain, 0] - still[plain]).max() < 1e-12
+        parts = fluid.velocity.parts[fluid.sheets.table.axis == 0]
+        assert len(parts) >= 14 and np.minimum(np.abs(parts), np.abs(parts - 1)).max() < 1e-12
+        assert np.abs(own(fluid, 1)).max() < 1e-12
+        assert np.all(fluid.smoke[fluid.grid.owned(None)][:, y < height - 1 / 16] == 0.0)
+
+
 @pytest.mark.parallel([1, 2])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("cells", [(14, 12), (12, 7, 6)])

@@ -6,9 +6,11 @@ from mac_cases import make_fluid, make_scene
 from mpi4py import MPI
 
 from petfsi.errors import InputError
+from petfsi.fields.mac.fluid import MacFluid
 from petfsi.geometry.openings import parts_within
 from petfsi.geometry.shapes import inside
-from petfsi.plan import describe_plan
+from petfsi.scene.checks import problems
+from petfsi.scene.schema import Scene
 from petfsi.scene.tables import Shape
 
 
@@ -127,9 +129,68 @@ def test_a_profile_is_taken_at_the_centroids_of_the_parts():
     assert np.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)
 
 
-def test_a_region_that_meets_no_part_of_its_side_is_named():
-    region = {"ball": {"centre": [-0.2, 0.5], "radius": 0.1}}
-    scene = make_scene((8, 8), sides={"left": {"inflow": {"speed": 1.0, "region": region}}, "right": "open"})
-    for look in (describe_plan, lambda scene: make_fluid((8, 8), sides=scene.fluid.sides.model_dump())):
-        with pytest.raises(InputError, match="fluid.sides.left.inflow.region: meets no part of the side"):
-            look(scene)
+def through_walls(rng, number):
+    """Return a scene with a bar or disk through the left side and a jet, and what is open to the jet."""
+    n, middle = int(rng.integers(6, 12)), rng.uniform(0.2, 0.8)
+    low = rng.uniform(0.0, 0.8)
+    high = rng.uniform(low + 0.01, 0.99)
+    if number % 3 == 0:
+        low, high = min(low, middle - 0.1), middle  # it ends within the body
+    if number % 2:
+        radius = rng.uniform(0.05, 0.3)
+        body = {"ball": {"centre": [rng.uniform(-0.5, 0.5) * radius, middle], "radius": radius}}
+    else:
+        thickness = rng.choice([0.003, 0.01, 0.13, 0.3])
+        body = {"box": {"origin": [-1.0, middle - thickness / 2], "size": [1.0 + rng.uniform(0.2, 0.5), thickness]}}
+    region = {"box": {"origin": [-0.1, low], "size": [0.2, high - low]}}
+    sides = {"left": {"inflow": {"speed": 2.0, "region": region}}, "right": "open"}
+    fluid = {"density": 1.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [18, n], "sides": sides}
+    data = {"dim": 2, "time": {"end": 1.0, "dt": 0.1, "integrator": "bdf2"}, "fluid": fluid}
+    return Scene.model_validate(data | {"obstacles": {"body": {"shape": body}}}), low, high
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_jet_brings_exactly_the_flux_of_what_walls_leave_of_its_region():
+    rng = np.random.default_rng(0)
+    for number in range(40 if MPI.COMM_WORLD.size == 1 else 6):
+        scene, low, high = through_walls(rng, number)
+        fluid = MacFluid(MPI.COMM_WORLD, scene)
+        fluid.surroundings.evaluate(0.0)
+        fluid.surroundings.prescribe(fluid.face_kind, fluid.boundary_velocity)
+        points, facets = fluid.surface
+        one, other = points[facets[:, 0]], points[facets[:, 1]]
+        through = one[:, 0] * other[:, 0] < 0
+        share = one[through, 0] / (one[through, 0] - other[through, 0])
+        bottom, top = np.sort(one[through, 1] + share * (other[through, 1] - one[through, 1]))
+        wanted = 2.0 * (high - low - max(0.0, min(top, high) - max(bottom, low)))
+        assert flux(fluid) == pytest.approx(wanted, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        {"ball": {"centre": [-0.2, 0.5], "radius": 0.1}},
+        {"box": {"origin": [0.1, 0.0], "size": [0.2, 0.5]}},
+        {"box": {"origin": [-0.1, 1.1], "size": [0.2, 0.5]}},
+        {"halfspace": {"point": [-0.1, 0.0], "normal": [1.0, 0.0]}},
+    ],
+    ids=str,
+)
+def test_a_region_that_meets_no_part_of_its_side_is_named(region):
+    sides = {"left": {"inflow": {"speed": 1.0, "region": region}}, "right": "open"}
+    scene = make_scene((8, 8), sides=sides)
+    assert [str(problem).split(" = ")[0] for problem in problems(scene)] == [
+        f"fluid.sides.left.inflow.region.{next(iter(region))}"
+    ]
+    with pytest.raises(InputError, match="fluid.sides.left.inflow.region: meets no part of the side"):
+        make_fluid((8, 8), sides=sides)
+
+
+def test_regions_that_meet_a_part_of_their_sides_are_not_named():
+    rng = np.random.default_rng(11)
+    for number in range(40):
+        dim = 2 + number % 2
+        region = random_region(rng, dim, ("box", "ball")[number // 2 % 2])[0]
+        assert not problems(
+            make_scene((8,) * dim, sides={"left": {"inflow": {"speed": 1.0, "region": region}}, "right": "open"})
+        )

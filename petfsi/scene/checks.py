@@ -17,7 +17,6 @@ from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.fluids import (
     Fluid,
     GridInflow,
-    HydrostaticSide,
     Inflow,
     InflowSide,
     MacFluid,
@@ -46,8 +45,9 @@ from petfsi.scene.shape_checks import (
     sizes,
     solid_shape,
 )
+from petfsi.scene.side_checks import grid_sides
 from petfsi.scene.stepping import Stepping
-from petfsi.scene.tables import Halfspace, Number
+from petfsi.scene.tables import Halfspace
 
 MAX_STEPS = 10**8
 
@@ -191,32 +191,10 @@ def _jets(scene: Scene, inflows: list[tuple[str, Inflow]]) -> Problems:
         if inflow.smoke > 0 and fluid.smoke is None:
             allowed = "smoke needs a table [fluid.smoke] (it may be empty)"
             yield Problem(f"fluid.sides.{side}.inflow.smoke", inflow.smoke, allowed, ("fluid.smoke",))
-        yield from _along(f"fluid.sides.{side}.inflow.along", inflow.along, side, scene.dim)
     leaves = any(open_side(form) is not None for _, form in fluid.sides)
     if len(inflows) == 1 and not leaves and not scene.solids:
         allowed = 'what flows in must be able to leave: make a side open, or set rest = "open" here'
         yield Problem(f"fluid.sides.{inflows[0][0]}.inflow", ABSENT, allowed, ("fluid.sides", "solids"))
-
-
-def _along(key: str, along: list[Number] | None, side: str, dim: int) -> Problems:
-    """Judge what a jet carries in along its side: nothing across it, which is its speed."""
-    yield from length(key, along, dim)
-    axis = next(a for a, pair in enumerate(OPPOSITE) if side in pair)
-    if along is not None and axis < len(along) == dim and along[axis] != 0:
-        allowed = f"must be 0: what comes in across the side, along {'xyz'[axis]}, is its speed"
-        yield Problem(f"{key}.{axis}", along[axis], allowed)
-
-
-def _hydrostatic(scene: Scene) -> Problems:
-    """Refuse a fluid at rest that weighs nothing."""
-    if scene.fluid is None or scene.gravity is not None:
-        return
-    for side, form in scene.fluid.sides:
-        given = form.inflow.rest if isinstance(form, InflowSide) else form
-        if given == "hydrostatic" or isinstance(given, HydrostaticSide):
-            inner = ".inflow.rest" if isinstance(form, InflowSide) else ""
-            allowed = "is the pressure of fluid that gravity pulls on; give the scene one"
-            yield Problem(f"fluid.sides.{side}{inner}", "hydrostatic", allowed, ("gravity",))
 
 
 # ---- obstacles ----------------------------------------------------------------------------------------------
@@ -374,7 +352,7 @@ CHECKS: tuple[Callable[[Scene], Problems], ...] = (
     _fluid,
     _transfer,
     _sides,
-    _hydrostatic,
+    grid_sides,
     particles,
     _solids,
     _obstacles,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
-from petfsi.scene.expressions import Expression
+from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.fluids import GridInflowSide, MacFluid
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import OPPOSITE, periods
@@ -20,11 +22,9 @@ def side_notes(scene: Scene) -> list[str]:
     fluid = scene.fluid
     if not isinstance(fluid, MacFluid) or scene.gravity is None:
         return []
-    times = np.linspace(0.0, scene.time.end, INSTANTS)
-    every = np.array([[float(Expression(g, ("t",), "gravity")(t=t)) for g in scene.gravity] for t in times])
-    every = every[:, : scene.dim] * (periods(fluid, scene.dim) == 0.0)  # nothing bears it along periodic axes
-    size = np.linalg.norm(every, axis=1)
-    down = every[size > 0.0] / size[size > 0.0, None]
+    down = _directions(scene) * (periods(fluid, scene.dim) == 0.0)  # nothing bears it along periodic axes
+    size = np.linalg.norm(down, axis=1)
+    down = down[size > 0.0] / size[size > 0.0, None]
     notes = []
     for axis, pair in enumerate(OPPOSITE[: scene.dim]):
         for sign, name in zip((-1.0, 1.0), pair, strict=True):
@@ -36,3 +36,12 @@ def side_notes(scene: Scene) -> list[str]:
                     f'"hydrostatic" or {{ hydrostatic = height (m) }} holds it, {{ pressure = ... }} is any other'
                 )
     return notes
+
+
+def _directions(scene: Scene) -> np.ndarray:
+    """Return gravity at some instants of the run, shape (n, dim); where it has no value the run itself will say so."""
+    found = []
+    for t in np.linspace(0.0, scene.time.end, INSTANTS):
+        with suppress(ExpressionError):
+            found.append([float(Expression(g, ("t",), "gravity")(t=t)) for g in scene.gravity or ()])
+    return np.array(found).reshape(-1, scene.dim)

@@ -150,6 +150,8 @@ class MacFluid(CoveredGrid):
     def _divide(self, parts: Parts, old_kind: list[np.ndarray], other: np.ndarray) -> None:
         """Let divided faces and cells go on with what those had that they come from. Collective."""
         old, grid = self.sheets, self.grid
+        if self.surroundings.has_jets:  # what is open of a face may be so to a jet or not
+            self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         self.sheets = self._sheets_of(parts)
         self._transport.advection.sheets = self.sheets
         if old is None:
@@ -186,8 +188,9 @@ class MacFluid(CoveredGrid):
 
     def _sheets_of(self, parts: Parts) -> Sheets:
         assert self.narrow is not None
-        behind = self.surroundings.behind_jets
-        return Sheets(self.grid, parts, self.face_kind, self.narrow, self.cell_kind, behind)
+        around = self.surroundings
+        narrow = around.not_read(self.narrow)
+        return Sheets(self.grid, parts, self.face_kind, narrow, self.cell_kind, around.behind_jets)
 
     def _go_on(self, lineage: Lineage) -> None:
         """Take over velocities and smoke of the former parts. Collective."""
@@ -438,14 +441,13 @@ class MacFluid(CoveredGrid):
             self.grid.fill_sides(known, axis)
             extended.append(known)
         new = Faces(extended, faces.parts)
+        if self.sheets is not None and self.sheets.anywhere:
+            # a band takes both sides; and what is narrow now may be read as it is in the next step
+            new = self.sheets.renew_faces(new, self.sheets.slim)
+            for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
+                np.copyto(v, known, where=slit & slim)
         if self.surroundings.carries_along:
             self.surroundings.fill_along(new)
-        if self.sheets is None or not self.sheets.anywhere:
-            return new
-        # a band takes both sides; and what is narrow now may be read as it is in the next step
-        new = self.sheets.renew_faces(new, self.sheets.slim)
-        for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
-            np.copyto(v, known, where=slit & slim)
         return new
 
     def _complete_cells(self, smoke: np.ndarray) -> None:

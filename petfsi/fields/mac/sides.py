@@ -61,8 +61,8 @@ class Jet:
         Centroids of the parts of the faces that it comes through.
     part : ndarray, shape (n,)
         These parts: fractions of the faces.
-    value : ndarray, shape (n,)
-        Velocity along the axis at the time last evaluated, the mean over the whole face, m/s.
+    mean : ndarray, shape (n,)
+        What part of that which is open of a face it comes through: ``part`` where nothing cuts faces.
     squares : ndarray, shape (n,)
         The squared speed of what comes in, without what it has along the side unless that is given, m^2/s^2.
     """
@@ -74,12 +74,13 @@ class Jet:
     faces: tuple[np.ndarray, ...]
     points: np.ndarray
     part: np.ndarray
-    value: np.ndarray = field(init=False)
+    mean: np.ndarray = field(init=False)
     squares: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         """Start with the jet closed."""
-        self.value, self.squares = np.zeros(len(self.points)), np.zeros(len(self.points))
+        self.mean = self.part.copy()
+        self._rate, self.squares = np.zeros(len(self.points)), np.zeros(len(self.points))
         self._speed = Expression(self.spec.speed, key=f"{self.key}.speed")
         self._along = [Expression(v, key=f"{self.key}.along") for v in self.spec.along or ()]
         self._beside: list[tuple[int, tuple[np.ndarray, ...], np.ndarray]] = []
@@ -110,10 +111,20 @@ class Jet:
         points[:, self.axis] = at
         return index, points
 
+    @property
+    def value(self) -> np.ndarray:
+        """Velocity along the axis at the time last evaluated, the mean over what is open of each face, m/s, (n,)."""
+        return self.mean * self._rate
+
+    @property
+    def divides(self) -> bool:
+        """Whether it comes through a part of any face here."""
+        return bool(np.any(self.part < 1.0))
+
     def evaluate(self, time: float) -> None:
         """Set ``value`` and ``squares`` for a time."""
         speed = ramp(time, self.spec.ramp) * evaluate_at(self._speed, self.points, time)
-        self.value[:] = (-1.0 if self.upper else 1.0) * self.part * speed
+        self._rate[:] = (-1.0 if self.upper else 1.0) * speed
         self.squares[:] = speed**2
         for along in self._along:
             self.squares += evaluate_at(along, self.points, time) ** 2
@@ -238,6 +249,18 @@ class Surroundings:
                 continue
             wall = face_kind[jet.axis][jet.faces] == kinds.WALL
             boundary_velocity[jet.axis][tuple(i[wall] for i in jet.faces)] = jet.value[wall]
+
+    def not_read(self, narrow: list[np.ndarray]) -> list[np.ndarray]:
+        """Return which faces water near sheets does not read: narrow ones, and those with a jet on a part of them.
+
+        If such a face is divided, its sides have velocities of their own, and it has one alone.
+        """
+        for jet in self.jets:
+            if jet.divides:
+                mixed = jet.part < 1.0
+                narrow = [faces.copy() if a == jet.axis else faces for a, faces in enumerate(narrow)]
+                narrow[jet.axis][tuple(i[mixed] for i in jet.faces)] = True
+        return narrow
 
     def squares(
         self, axis: int, upper: bool, across: np.ndarray, along: np.ndarray, at: tuple[slice, ...]
