@@ -435,6 +435,7 @@ class Simulation:
         group : callable
             Returns the reader of a group of ``state`` by its name.
         """
+        self.forget()  # of the scene's start
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
