@@ -336,12 +336,7 @@ def everything(integrator):
     shape = {"beam": {"start": [0.52, 0.25], "end": [0.79, 0.57], "thickness": 0.004, "elements": 6}}
     solid = {"shape": shape, "young": 1e8, "poisson": 0.3, "density": RHO}
     more = {"fluid": {"smoke": {"buoyancy": 0.1}}, "gravity": ["0.5*sin(t)", -9.81]}
-    # a free strip does not come back to the last bit with newmark, whatever the sides
-    more |= (
-        {"obstacles": {"sheet": box([0.5, 0.3], [0.7, 0.01])}}
-        if integrator == "newmark"
-        else {"solids": {"strip": solid}}
-    )
+    more |= {"solids": {"strip": solid}}
     return scene((18, 14), sides, integrator, dt=0.03, **more)
 
 
