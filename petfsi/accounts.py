@@ -36,21 +36,25 @@ class Accounts:
         Energy stored in the solids, and in the compression of particles.
     ``potential``
         Minus the work of gravity so far: on the solids' mass along the way it went, and on the fluid. Cut cells:
-        through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f dt.
+        through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f.
     ``dissipated``
-        What Rayleigh damping took so far, sum w . C w dt, with w where the integrator takes the forces; and
-        of particles their viscosity, the diffusion of density, and shifting as far as it lowered their weight.
+        What Rayleigh damping took so far, w . C w; and of particles their viscosity, the diffusion of density, and
+        shifting as far as it lowered their weight.
     ``load_work``
         Of the solids' body forces and loads so far, along the way that nodes moved.
     ``boundary_work``
-        What came in so far: the supports' reactions, the residual of their equations, times w dt; through inflows
-        and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow; and
-        with what closes the volume of regions, pressure times that. Of particles the work of sides that move, and the
-        energy of all that came and left, with what is done on them beyond sides.
+        What came in so far: the supports' reactions, the residual of their equations, along the way of their nodes;
+        through inflows and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times
+        the flow; and with what closes the volume of regions, pressure times that. Of particles the work of sides that
+        move, and the energy of all that came and left, with what is done on them beyond sides.
     ``energy_residual``
         kinetic + elastic + potential + dissipated - load_work - boundary_work, less its initial value: what the
         scheme's own damping took (negative) or gave, with advection, cuts that change and what linearising a step
-        leaves out. With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions.
+        leaves out. With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions. In statics
+        it is what loads set free that the state at the start does not bear.
+
+    Forces times a way go through ``ForceWork``, powers through the trapezoidal rule, of ``midpoint`` through its own:
+    both are of second order. The power before the first step is that of the first step.
 
     Columns that a scene has no use for are left out, all of them if ``output.accounts`` is false.
 

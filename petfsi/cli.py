@@ -156,10 +156,15 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
     """Print what SCENE would solve, or every mistake in it, without running."""
 
     def work() -> int:
-        from petfsi.plan import describe_plan
+        from petfsi.plan import describe_plan, judge_first_step, may_lack_a_solution
         from petfsi.scene.load import load_scene
 
-        _say(describe_plan(load_scene(scene, sets), ctx.meta["petsc"]))
+        loaded = load_scene(scene, sets)
+        plan = describe_plan(loaded, ctx.meta["petsc"])
+        if may_lack_a_solution(loaded):
+            _start_petsc([])
+            judge_first_step(loaded)
+        _say(plan)
         return 0
 
     ctx.exit(_alone(work))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from petfsi.errors import SolveError
 from petfsi.fields.base import SolidField
 from petfsi.system import System
 
@@ -75,7 +76,10 @@ class Modes:
         whole = total.sum(axis=0)
         size = np.sqrt(whole.diagonal())
         size[size == 0] = 1.0
-        self._capacity = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-13, hermitian=True)
+        try:
+            self._capacity = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-13, hermitian=True)
+        except np.linalg.LinAlgError:
+            raise SolveError("the motions of light bodies push on the fluid beyond what numbers can hold") from None
         self._capacity /= np.outer(size, size)
         for vec in (motion, resisted, pushed, answer):
             vec.destroy()

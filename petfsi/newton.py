@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.errors import InputError, SolveError
-from petfsi.system import System
+from petfsi.system import System, blown_up
 
 #: Linearise once, or iterate.
 KINDS = ("ksponly", "newtonls")
@@ -157,7 +157,10 @@ class Newton:
 
     def _floor(self, x: PETSc.Vec) -> float:
         """Return the norm of the function that is round-off at x. Collective."""
-        return self.system.round_off(x)
+        floor = self.system.round_off(x)
+        if not np.isfinite(floor):
+            raise SolveError(blown_up([field.name for field in self.system.fields]))
+        return floor
 
     def _aim(self, snes: PETSc.SNES, _step: int) -> None:
         """Ask for no less than round-off, which grows with the way. Collective."""

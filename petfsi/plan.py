@@ -14,6 +14,7 @@ import numpy as np
 from petfsi import __version__
 from petfsi.errors import InputError
 from petfsi.plan_fluids import ENTRY_BYTES, KRYLOV_VECTORS, PRECONDITIONER, fluid_plan, fluid_skipped
+from petfsi.scene.fluids import GridInflowSide, MacFluid
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 
@@ -23,6 +24,8 @@ DEFAULT_OPTIONS, LARGE_OPTIONS = "monolithic.opts", "solid-large.opts"
 LARGE = 50_000
 #: Steps of changing length are counted up to here.
 MAX_COUNTED = 100_000
+#: Cells of a grid up to which the first step of its fluid is assembled to see whether it has a solution.
+JUDGED = 1_000_000
 #: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.
 PROGRAM_BYTES = 250e6
 
@@ -96,6 +99,38 @@ def skipped(scene: Scene) -> list[str]:
     if scene.output.every is None:
         out.append("fields.xdmf: there is no output.every")
     return out
+
+
+def may_lack_a_solution(scene: Scene) -> bool:
+    """Return whether it takes the first step's equations to know that they have a solution.
+
+    Of a fluid with so many cells that it would take long this is left to the run.
+    """
+    fluid = scene.fluid
+    if fluid is None:
+        return scene.time.integrator == "static"
+    if not isinstance(fluid, MacFluid) or math.prod(fluid.cells) > JUDGED:
+        return False
+    inflows = [form.inflow for _, form in fluid.sides if isinstance(form, GridInflowSide)]
+    supports = [support for solid in scene.solids.values() for support in solid.supports]
+    moves = any(support.velocity or support.displacement for support in supports)
+    leaves = any(form == "open" for _, form in fluid.sides) or any(inflow.rest == "open" for inflow in inflows)
+    return (bool(inflows) or moves) and (not leaves or bool(scene.solids) or bool(scene.obstacles))
+
+
+def judge_first_step(scene: Scene) -> None:
+    """Assemble the first step. Not collective.
+
+    Raises
+    ------
+    InputError
+        If it has no solution, or what is assembled cannot be built.
+    """
+    from mpi4py import MPI
+
+    from petfsi.simulation import Simulation
+
+    Simulation(MPI.COMM_SELF, scene).rehearse()
 
 
 def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> list[tuple[str, str]]:

@@ -59,6 +59,13 @@ class ClosedRegions:
         What may bound regions.
     decoupled : bool
         Whether the pressure block is inverted by itself: then no source can close a volume.
+
+    Attributes
+    ----------
+    unfelt : list of ndarray
+        Pressures, even in each region, that no solid feels, as ``attach`` found them: this rank's part.
+    ways : ndarray, shape (n_unfelt, n_regions)
+        What they are in each region.
     """
 
     def __init__(self, system: System, fluid: PressureFluid, solid: SolidField | None, decoupled: bool) -> None:
@@ -69,6 +76,8 @@ class ClosedRegions:
         self._found_for: tuple[int, ...] | None = None
         self._attached_for: tuple[int, ...] | None = None
         self._members: list[np.ndarray] = []
+        self.unfelt: list[np.ndarray] = []
+        self.ways = np.zeros((0, 0))
         self._elastic = np.zeros(0, dtype=bool)
         self._walls: Enclosure | None = None
         self._lasting: list[int] = []  # number of each present region; 0 if it has none
@@ -228,11 +237,12 @@ class ClosedRegions:
         if version == self._attached_for:
             return
         self._attached_for = version
-        free = self._unfelt()
-        _attach(fluid.block, self._members if self.decoupled else free)
+        self.ways = self._find_unfelt()
+        self.unfelt = [np.tensordot(way, np.array(self._members), axes=1) for way in self.ways]
+        _attach(fluid.block, self._members if self.decoupled else self.unfelt)
         if system.index_sets:
-            whole = np.zeros((len(free), system.solution.local_size))
-            for row, values in zip(whole, free, strict=True):
+            whole = np.zeros((len(self.unfelt), system.solution.local_size))
+            for row, values in zip(whole, self.unfelt, strict=True):
                 row[system.piece(fluid.name)] = values
             _attach(system.operator, list(whole))
 
@@ -247,14 +257,14 @@ class ClosedRegions:
             self.decoupled, self._attached_for = decoupled, None
             self.attach()
 
-    def _unfelt(self) -> list[np.ndarray]:
-        """Return the pressures, even in each region, that no solid feels: an orthogonal set, this rank's part.
+    def _find_unfelt(self) -> np.ndarray:
+        """Return the pressures, even in each region, that no solid feels: an orthogonal set, shape (n, n_regions).
 
         Those of regions with rigid walls alone, and what rooms on two sides of a beam have in common. Collective.
         """
         n = len(self._members)
         if not np.any(self._elastic):
-            return self._members
+            return np.eye(n)
         forces = []
         for coupling in self.system.couplings:
             block = coupling.blocks[self.solid.name, self.fluid.name]  # type: ignore[union-attr]
@@ -271,11 +281,11 @@ class ClosedRegions:
         felt, ways = np.linalg.eigh(gram / np.outer(scale, scale))
         kernel = ways[:, felt <= UNFELT] / scale[:, None]
         if not kernel.shape[1]:
-            return []
+            return np.zeros((0, n))
         # orthogonal as pressures
         root = np.sqrt(sizes.diagonal())
         basis, _ = np.linalg.qr(root[:, None] * kernel)
-        return [np.tensordot(column / root, np.array(self._members), axes=1) for column in basis.T]
+        return basis.T / root
 
     # ---- closing their volumes --------------------------------------------------------------------------------
 
@@ -353,11 +363,35 @@ class ClosedRegions:
             change = self._walls.change(self.solid.surface_arrival(velocity, dt))
             self._end = self._cut_sizes + self.system.comm.allreduce(change)
 
+    def swept(self, dt: float) -> np.ndarray:
+        """Return this rank's share of what regions cannot take of what sides let in in a step of dt, m^3 (m^2 in 2D).
+
+        What comes in at the step's rate, less what they gain as prescribed points go and free ones stay. Collective.
+        """
+        gained, solid = np.zeros(len(self._members)), self.solid
+        if self._walls is not None and solid is not None:
+            given = solid.fixed_velocity()[solid.layout.start : solid.layout.end]
+            here = solid.surface_present()
+            way = solid.surface_arrival(given, dt) - here
+            way[np.diff(solid.surface().fixed_map.indptr).reshape(way.shape) == 0] = 0.0
+            gained = self._walls.change(here + way) - self._walls.change(here)
+        return dt * self._inflows() - gained
+
+    def inject(self, source: np.ndarray) -> None:
+        """Let what comes into cells from nowhere come into the step assembled, too. Collective."""
+        self.fluid.source = source if self.fluid.source is None else self.fluid.source + source
+        if self.system.couplings:
+            self.system.couplings[0].inject(source)
+        else:
+            self.fluid.rhs += source
+
     def improve(self) -> bool:
         """Add sources to the right-hand side if a region was measured to have another volume; say so."""
         if not self._closes:
             return False
         missing = self._wanted - self._end
+        # what nothing gives way to is not to be had
+        missing -= np.linalg.pinv(self.ways) @ (self.ways @ np.nan_to_num(missing))
         if not np.any(np.abs(missing) > CLOSE * np.maximum(self._wanted, self.fluid.cell_volume)):
             return False
         self.system.couplings[0].inject(self._spread(missing / self._stride))

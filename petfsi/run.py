@@ -315,7 +315,6 @@ def resume_run(
             )
         # of the scene's start: it would move the fluid's faces to the restored solid
         unread = simulation.prepare(resumes=True)
-        simulation.forget()
         with checkpoints.read_checkpoint(found, comm) as stored:
             simulation.restore(stored.step, stored.time, stored.dt, stored.group)
         _greet(console, simulation, unread)

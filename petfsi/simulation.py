@@ -11,9 +11,10 @@ from mpi4py import MPI
 
 from petfsi import build, petsc, start
 from petfsi.accounts import Accounts
+from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
-from petfsi.errors import SolveError, TouchError
+from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
 from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
 from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
@@ -38,6 +39,9 @@ START_NOTED = 1e-3
 #: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
 #: is left.
 REPEATS = 6
+
+#: How far from the origin solids may begin, over their extent: round-off leaves seven digits of it.
+FAR = 1e9
 
 
 class Simulation:
@@ -146,7 +150,7 @@ class Simulation:
         try:
             self._attempt(t, dt)
         except SolveError as error:
-            if retries == 0 or isinstance(error, TouchError):
+            if retries == 0 or isinstance(error, FinalError):
                 raise
             why = str(error).split(": ")[0]
             self.report(f"t = {t:.6g} s: the step of {dt:g} s is taken again as two halves: {why}")
@@ -158,11 +162,14 @@ class Simulation:
         with self.phase("predict"):
             for field in self.fields:
                 field.predict(t, dt)
+            if self.solid and not self.solid.explicit:  # before anything looks for where that is
+                self._check_speed(self.solid, self.solid.predicted() / dt, dt)
         with self.phase("couple"):
             for coupling in self.couplings:
                 coupling.couple(t, dt)
         with self.phase("assemble"):
             changed = self._assemble(t, dt)
+            self._balance(dt)
         with self.phase("solve"):
             outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
         with self.phase("accept"):
@@ -197,16 +204,23 @@ class Simulation:
         SolveError
             On all ranks, if that start cannot be found.
         """
-        self.dt = self._length(self.time)
-        self.stable.count(self.time, self.dt)
-        for coupling in self.couplings:
-            coupling.couple(self.time, self.dt)
-        self._assemble(self.time, self.dt)
+        self.rehearse()
         unread = self.solver.check_options()
         self.accounts.start()
         if not resumes:
             self._fit_velocities()
         return unread
+
+    def rehearse(self) -> None:
+        """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
+        self.dt = self._length(self.time)
+        self._check_start()
+        self.stable.count(self.time, self.dt)
+        for coupling in self.couplings:
+            coupling.couple(self.time, self.dt)
+        self._assemble(self.time, self.dt)
+        with np.errstate(all="ignore"):  # what overflows is found by those who judge the solve
+            self._check_equations()
 
     def _fit_velocities(self) -> None:
         """Let fluid and solids begin with velocities that fit each other; note what that did. Collective."""
@@ -222,6 +236,18 @@ class Simulation:
                 f"the velocities given at t = 0 did not fit each other, and were brought to the nearest that do: "
                 f"kinetic energy {after:.4g} J, not {before:.4g} J"
             )
+
+    def _check_equations(self) -> None:
+        """Refuse a scene whose first step has no solution: before anything is written. Collective."""
+        wrong = self.solid.unheld() if self.solid else []
+        if self.regions:
+            fluid = self.regions.fluid
+            fluid.rehearse(self.time, self.dt)
+            fault = Balance(self.regions).fault(self.dt)
+            fluid.rehearse(self.time, 0.0)
+            wrong += [f"{fault} (in the first step)"] if fault else []
+        if wrong:
+            raise InputError("\n".join(wrong))
 
     def _assemble(self, t: float, dt: float) -> bool:
         if self.regions:
@@ -241,6 +267,17 @@ class Simulation:
             self.regions.attach()
         return changed
 
+    def _balance(self, dt: float) -> None:
+        """Raise if what flows into closed regions has nowhere to go, else make up for what is left over. Collective."""
+        if not self.regions:
+            return
+        balance = Balance(self.regions)
+        fault = balance.fault(dt)
+        if fault:
+            raise NoSolutionError(fault)
+        if balance.make_up():
+            self.system.refresh(guess=False)
+
     def _close(self, t: float, dt: float) -> Outcome:
         """Solve again, with sources that close the volumes of regions, while that is wanted. Collective."""
         outcome = Outcome(0, 0.0)
@@ -250,6 +287,7 @@ class Simulation:
             self.regions.measure(self.system.values()[self.system.fields.index(self.solid)], dt)
             if repeat == REPEATS or self.solver.fixed_iterations or not self.regions.improve():
                 break
+            Balance(self.regions).make_up()
             self.system.refresh(guess=False)
             outcome += self.solver.improve(lambda values: self._restage(values, t, dt))
         return outcome
@@ -269,7 +307,10 @@ class Simulation:
             self.volume_error = max(self.volume_error, self.regions.volume_error(dt))
         values = dict(zip((field.name for field in self.system.fields), self.system.values(), strict=True))
         if self.solid:
-            self._check_speed(self.solid, values["solid"], dt)
+            fastest = float(np.abs(self.solid.along_axes(values["solid"])).max(initial=0.0))
+            fastest = self._check_speed(self.solid, fastest, dt)
+            if self.stable.limited:
+                self.stable.moved(fastest * dt)
             self.solid.judge(values["solid"], dt)
             if self.watch:
                 self.watch.judge(self.solid.surface_arrival(values["solid"], dt), t, dt)
@@ -285,17 +326,36 @@ class Simulation:
             self.report(f"t = {t + dt:.6g} s: {remark}")
         self.accounts.update(values.get("pressure"), dt)
 
-    def _check_speed(self, solid: SolidField, velocity: np.ndarray, dt: float) -> None:
-        """Raise if a node would cross the whole scene in one step: the state has blown up."""
-        fastest = self.comm.allreduce(float(np.abs(solid.along_axes(velocity)).max(initial=0.0)), MPI.MAX)
+    def _check_start(self) -> None:
+        """Refuse positions so far off that nothing is left of the body's shape there. Collective."""
+        if self.solid is None:
+            return
+        way = float(np.abs(self.solid.surface_present()).max(initial=0.0))
+        if not way < FAR * self.solid.extent:
+            raise InputError(
+                f"the solids' initial displacement: brings a point {way:.3g} m off, which is more than {FAR:g} times "
+                f"the largest side of the solids ({self.solid.extent:g} m)"
+            )
+
+    def _check_speed(self, solid: SolidField, fastest: float, dt: float) -> float:
+        """Return the largest speed of all ranks; raise if a node would cross the whole scene in one step. Collective.
+
+        Parameters
+        ----------
+        solid : SolidField
+        fastest : float
+            This rank's, m/s.
+        dt : float
+        """
+        # of what is no number the largest may be anything
+        fastest = self.comm.allreduce(fastest if np.isfinite(fastest) else np.inf, MPI.MAX)
         extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
-        if self.stable.limited:
-            self.stable.moved(fastest * dt)
         if not fastest * dt < extent:
             raise SolveError(
                 f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
                 f"in one step of {dt:g} s. {self._advice()}"
             )
+        return fastest
 
     def _advice(self) -> str:
         """Return what may help a run that blows up."""
@@ -375,6 +435,7 @@ class Simulation:
         group : callable
             Returns the reader of a group of ``state`` by its name.
         """
+        self.forget()  # of the scene's start
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))

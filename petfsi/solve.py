@@ -19,7 +19,7 @@ from petfsi.multigrid import Hierarchy
 from petfsi.newton import Newton, Restage, as_it_is, snes_type
 from petfsi.option_stories import option_story, petsc_text
 from petfsi.pressure_solver import PressureSolver
-from petfsi.system import System
+from petfsi.system import System, blown_up
 
 #: The solve of a step.
 PREFIX = "fsi_"
@@ -34,6 +34,9 @@ DYNAMICS = {"snes_linesearch_type": "bt"}
 
 #: How far the true residual may lie above the tolerance that the solver itself tested.
 SLACK = 10.0
+#: Round-off of the solution may leave this part of the right-hand side; where it is more, K is singular to double
+#: precision, and what is solved for may be anything.
+COARSEST = 1e-4
 
 
 def field_prefix(name: str) -> str:
@@ -282,10 +285,11 @@ class Solver:
                 self.set_up()
             newton, iterations, residual = self._iteration().solve(changed, restage)
             return Outcome(iterations, residual, newton)
+        self.system.check()  # before anything is made of numbers that are none
         if changed:
             self.set_up()
         iterations, norms = self.solve_linear(self.system.rhs, self.system.solution)
-        return Outcome(iterations, norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0)
+        return Outcome(iterations, self._relative(norms))
 
     def improve(self, restage: Restage = as_it_is) -> Outcome:
         """Solve again for a right-hand side that has changed a little, from the solution there. Collective.
@@ -318,8 +322,19 @@ class Solver:
         # what the preconditioner is judged by is a whole solve
         self._inner_iterations = kept
         system.solution.axpy(1.0, y)
-        norms = system.update_residual()
-        return Outcome(iterations, norms[""] / norms["rhs"] if norms["rhs"] > 0 else 0.0)
+        return Outcome(iterations, self._relative(system.update_residual()))
+
+    def _relative(self, norms: dict[str, float]) -> float:
+        """Return |b - Kx|/|b|; of no more than round-off, the part that it is of what it is the round-off of.
+
+        Collective.
+        """
+        left, size = norms[""], norms["rhs"]
+        assert self._ksp is not None
+        if left > SLACK * self._ksp.getTolerances()[0] * size and not self.fixed_iterations:
+            lost = self.system.round_off_at(self.system.solution) + self.system.rhs_round_off()
+            size = max(size, lost / float(np.finfo(float).eps))
+        return left / size if size > 0 else 0.0
 
     def _iteration(self) -> Newton:
         if self._newton is None:
@@ -345,24 +360,42 @@ class Solver:
         SolveError
             On every rank, with the reason and the residual of each field.
         """
-        ksp = self._ksp
+        system, ksp = self.system, self._ksp
         assert ksp is not None
-        floor = self.system.rhs_round_off()
+        size, floor = b.norm(), self._floor()
+        if not np.isfinite(size + floor):
+            raise SolveError(blown_up([field.name for field in system.fields]))
+        rtol, warm = ksp.getTolerances()[0], ksp.getInitialGuessNonzero() and not self.fixed_iterations
+        if warm:
+            self._drop_coarse_guess(b, x, rtol * size, size)
         if ksp.getType() != PETSc.KSP.Type.PREONLY:
             if not PETSc.Options(self.prefix).hasName("ksp_atol"):
                 ksp.setTolerances(atol=floor)
             if self._pressure is not None:
-                self._pressure.aim(max(ksp.getTolerances()[0] * b.norm(), floor))
+                self._pressure.aim(max(rtol * size, floor))
         iterations = self._run(b, x)
-        norms = self.system.update_residual(x, b)
-        missed = norms[""] > max(ksp.getTolerances()[0] * norms["rhs"], floor)
-        if missed and ksp.getConvergedReason() > 0 and ksp.getInitialGuessNonzero() and not self.fixed_iterations:
-            # what iterations update drifts from the true residual by round-off: they go on from there
-            iterations += self._run(b, x)
-            self._inner_iterations = iterations
-            norms = self.system.update_residual(x, b)
-        self._judge(ksp, norms, slack, floor)
+        lost = 0.0
+        norms = system.update_residual(x, b)
+        if norms[""] > max(rtol * size, floor) and not self.fixed_iterations:
+            floor = self._floor()  # the first guess may have been nothing
+            if warm and ksp.getConvergedReason() > 0 and norms[""] > max(rtol * size, floor):
+                # what iterations update drifts from the true residual by round-off: they go on from there
+                iterations += self._run(b, x)
+                self._inner_iterations = iterations
+                norms = system.update_residual(x, b)
+            lost = system.round_off_at(x)
+        self._judge(ksp, norms, slack, floor, lost)
         return iterations, norms
+
+    def _drop_coarse_guess(self, b: PETSc.Vec, x: PETSc.Vec, wanted: float, size: float) -> None:
+        """Begin from zero if the guess is too coarse to get from it to what is wanted, and no better. Collective."""
+        if wanted < self.system.round_off_at(x) and not self.system.update_residual(x, b)[""] <= size:
+            x.set(0.0)
+
+    def _floor(self) -> float:
+        """Return what the residual cannot fall below at pressures as they are in the system's solution. Collective."""
+        floor = self.system.rhs_round_off()
+        return floor if self._pressure is None else max(floor, self._pressure.round_off())
 
     def _run(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
         """Run the solver; return its iterations, of the inner one if that takes more. Collective."""
@@ -374,28 +407,37 @@ class Solver:
             raise SolveError(f"solver '{self.prefix}' broke down: {petsc_text(error)}") from None
         return max(self._inner_iterations, self._ksp.getIterationNumber())
 
-    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float, floor: float) -> None:
+    def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float, floor: float, lost: float) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
         solvers = [ksp, *self._sub_solvers(ksp)]
         iterative = [s.getTolerances()[0] for s in solvers if s.getType() != PETSc.KSP.Type.PREONLY]
         outer = ksp.getType() != PETSc.KSP.Type.PREONLY
-        rtol = iterative[0] if outer else max(iterative, default=1e-8)
-        wanted = slack * max(rtol * norms["rhs"], floor)
+        rtol: float = iterative[0] if outer else max(iterative, default=1e-8)
+        round_off: float = SLACK * min(lost, COARSEST * norms["rhs"])
+        wanted = max(slack * max(rtol * norms["rhs"], floor), round_off)
         failed = [s for s in solvers if s.getConvergedReason() < 0]
         finite = np.isfinite(norms[""])
         if self.fixed_iterations:
             good = finite and not failed
         else:
-            good = finite and ksp.getConvergedReason() >= 0 and norms[""] <= wanted
+            # iterations may not tell that round-off lets them get no farther
+            ended = ksp.getConvergedReason() >= 0 or norms[""] <= round_off
+            good = finite and ended and norms[""] <= wanted
         if good:
             return
         by_field = ", ".join(f"{field.name} {norms[field.name]:.1e}" for field in self.system.fields)
         culprit = failed[-1] if failed else ksp
+        doubt = ""
+        if lost > COARSEST * norms["rhs"]:
+            doubt = (
+                f" Round-off alone may be {lost:.1e}: what resists least is lost beside what resists most, as where "
+                f"nothing holds a body, or where stiffness, density or step are extreme."
+            )
         raise SolveError(
             f"solver '{culprit.getOptionsPrefix()}' stopped with {petsc.reason_name(culprit)} after "
             f"{culprit.getIterationNumber()} iterations: |b - Kx| = {norms['']:.1e}, wanted {wanted:.1e} "
-            f"(|b| = {norms['rhs']:.1e}); by field: {by_field}. To tell the solver from the physics, run this step "
-            f"with -options_file monolithic-direct.opts."
+            f"(|b| = {norms['rhs']:.1e}); by field: {by_field}.{doubt} To tell the solver from the physics, run this "
+            f"step with -options_file monolithic-direct.opts."
         )
 
     def check_options(self) -> list[str]:
@@ -409,6 +451,7 @@ class Solver:
         InputError
             Naming each option, with the nearest one that was read.
         """
+        self.system.check_operator()
         self.set_up()
         assert self._ksp is not None
         if self.iterates:

@@ -9,6 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.couplings.base import Coupling
+from petfsi.errors import SolveError
 from petfsi.fields.base import Field
 
 
@@ -71,6 +72,7 @@ class System:
         # a block that stays was scaled already, unless it has been assembled since
         self._seen: dict[object, int] = {} if before is None else dict(before._seen)
         self._held = self._blocks()
+        self._sizes: dict[str, tuple[int, float]] = {}
 
     @property
     def unknowns(self) -> dict[str, int]:
@@ -120,6 +122,29 @@ class System:
         self._seen[part] = count
         return new
 
+    def check_operator(self) -> None:
+        """Raise unless the matrix and the first guess are finite. Collective."""
+        self.operator.mult(self.solution, self.residual)
+        parts = np.array([not np.isfinite(self.residual.array_r[piece]).all() for piece in self._pieces])
+        wrong = self.comm.allreduce(parts.astype(int))
+        if wrong.any():
+            raise SolveError(blown_up([field.name for field, n in zip(self.fields, wrong, strict=True) if n]))
+
+    def check(self) -> None:
+        """Raise unless the matrix, the right-hand side and the first guess are finite. Collective.
+
+        Raises
+        ------
+        SolveError
+            On every rank, with the fields in whose equations there is something else.
+        """
+        # a product hands on what is no number, from every entry that is stored
+        with np.errstate(all="ignore"):
+            norms = self.update_residual()
+        if not np.isfinite(norms[""] + norms["rhs"]):
+            fields = [field.name for field in self.fields if not np.isfinite(norms[field.name])]
+            raise SolveError(blown_up(fields or [field.name for field in self.fields]))
+
     def update_residual(self, x: PETSc.Vec | None = None, b: PETSc.Vec | None = None) -> dict[str, float]:
         """Compute b - operator * x and return its norm by field, and of all under ``""``. Collective.
 
@@ -140,6 +165,20 @@ class System:
         """Return what the norm of the residual at x (the solution if not given) cannot fall below. Collective."""
         return sum(field.round_off(part) for field, part in zip(self.fields, self.values(x), strict=True))
 
+    def round_off_at(self, x: PETSc.Vec) -> float:
+        """Return what no solver gets |b - K x| below near x, sum_f eps ||A_f|| ||x_f||, for any b. Collective."""
+        values = x.array_r
+        squares = self.comm.allreduce(np.array([values[piece] @ values[piece] for piece in self._pieces]))
+        lengths = zip(self.fields, np.sqrt(squares), strict=True)
+        return float(np.finfo(float).eps) * sum(self._size(field) * float(length) for field, length in lengths)
+
+    def _size(self, field: Field) -> float:
+        """Return the norm of a field's block. Collective, where it was assembled anew."""
+        known = self._sizes.get(field.name)
+        if known is None or known[0] != field.n_assembled:
+            known = self._sizes[field.name] = field.n_assembled, field.block.norm(PETSc.NormType.NORM_INFINITY)
+        return known[1]
+
     def rhs_round_off(self) -> float:
         """Return the norm of what rounding makes of a right-hand side that vanishes. Collective."""
         return sum(field.rhs_round_off() for field in self.fields)
@@ -154,3 +193,11 @@ class System:
     def piece(self, name: str) -> slice:
         """Return where a field's unknowns lie in the local vectors."""
         return self._pieces[[field.name for field in self.fields].index(name)]
+
+
+def blown_up(fields: Sequence[str]) -> str:
+    """Return what to say of fields whose equations hold something that is not finite."""
+    return (
+        f"the state has blown up: the step's equations of {' and '.join(fields)} hold numbers that are not finite, of "
+        f"an element inside out, or beyond 1e154. Smaller steps may help; look at loads, speeds and densities"
+    )

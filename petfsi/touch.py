@@ -117,6 +117,7 @@ class Watch:
 
     def __init__(self, comm: MPI.Comm, scene: Scene, solid: SolidField) -> None:
         self._period = periods(scene.fluid, scene.dim)
+        self._repeats = bool(np.any(self._period > 0.0))
         self._x = solid.surface_present()
         self._things = _bodies(scene, solid, self._x) + on_root(comm, lambda: _still(scene))
         self._n = len(scene.solids)
@@ -173,11 +174,12 @@ class Watch:
     def _near(self, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
         """Yield pairs of things, and by how much the first is moved, whose boxes meet."""
         one, other = self._pairs.T
-        length = np.where(self._period > 0.0, self._period, 1.0)
-        first = np.ceil((low[other] - high[one]) / length)
-        last = np.floor((high[other] - low[one]) / length)
-        meets = np.where(self._period > 0.0, first <= last, (low[other] <= high[one]) & (low[one] <= high[other]))
-        for a, b in self._pairs[meets.all(axis=1)].tolist():
+        apart = (low[one] > high[other]) | (low[other] > high[one])
+        if not self._repeats:
+            for a, b in self._pairs[~apart.any(axis=1)].tolist():
+                yield a, b, self._period
+            return
+        for a, b in self._pairs[~(apart & (self._period == 0.0)).any(axis=1)].tolist():
             for shift in images(self._period, (low[a], high[a]), (low[b], high[b])):
                 yield a, b, shift
 

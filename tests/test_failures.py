@@ -150,7 +150,10 @@ SCENES = {
     "no extent": (replaced("size = [3.0, 2.0]", "size = [3.0, 0.0]"), ["fluid.size = [3.0, 0.0]: must be greater"]),
     "no cells": (replaced("cells = [12, 8]", "cells = [12, 0]"), ["fluid.cells.1 = 0", "1"]),
     "half a cell": (replaced("cells = [12, 8]", "cells = [12, 8.5]"), ["fluid.cells.1 = 8.5: must be a whole number"]),
-    "unknown side": (replaced('right = "open"', 'right = "opne"'), ['right = "opne"', "'slip', 'open' or 'periodic'"]),
+    "unknown side": (
+        replaced('right = "open"', 'right = "opne"'),
+        ['right = "opne"', "'slip', 'open', 'hydrostatic' or 'periodic'"],
+    ),
     "side without a name": (replaced('right = "open"', 'rihgt = "open"'), ["no setting 'rihgt'; did you mean 'right'"]),
     "one periodic side": (replaced('right = "open"', 'right = "periodic"'), ["'left' must be periodic too"]),
     "z in 2D": (replaced('right = "open"', 'back = "open"'), ["fluid.sides.back", "bounds z, which dim = 2"]),

@@ -8,7 +8,24 @@ from processes import environment
 from step_cases import prepared, stored
 from test_restart import reader
 from test_run import PETFSI
-from touch_cases import CELL, LU, SPEEDS, ball, beam, box, led, moving, said, scene, solid, turning
+from touch_cases import (
+    CELL,
+    KINDS,
+    LU,
+    SPEEDS,
+    THINGS,
+    WAYS,
+    ball,
+    beam,
+    box,
+    led,
+    moving,
+    run,
+    said,
+    scene,
+    solid,
+    turning,
+)
 
 from petfsi.errors import TouchError
 from petfsi.scene.dump import dump_scene
@@ -242,3 +259,69 @@ def test_the_command_says_so_and_exits_with_3(tmp_path):
     lines = done.stderr.splitlines()
     assert "t = 0.23 s: solids.d leaves the fluid's box through fluid.sides.bottom at (0.5, 0) m, t = 0.22" in lines[0]
     assert "checkpoint" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("kind, thing, how, speed", [
+    ("triangles", "plate", "held", 10.0), ("quadratic triangles", "image", "thrown", 10.0),
+    ("straight beam", "wall", "held", 10.0), ("beam", "plate", "thrown", 1.0), ("beam", "open", "thrown", 10.0),
+    ("triangles", "periodic", "thrown", 10.0),
+])  # fmt: skip
+def test_whole_runs_stop_at_the_first_touch(kind, thing, how, speed):
+    found = run(kind, thing, how, speed, wet=True)
+    check_run(kind, thing, found)
+
+
+def check_run(kind, thing, found):
+    """Check what a run went into, and that it was no deeper than what bodies are drawn in by."""
+    wanted = {"wall": "fluid.sides.bottom", "body": "solids.other", "open": None, "periodic": None}
+    assert found[0] == wanted.get(thing, "obstacles.post")
+    if found[0] is not None:
+        cell, edge = (CELL, 0.1) if KINDS[kind][1] == 2 else (0.1, 0.4)
+        assert -1e-3 <= found[1] <= TOUCH * (2 * edge if thing == "body" else cell) / cell + 1e-3
+    else:
+        assert found[1] > 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize("how", WAYS)
+@pytest.mark.parametrize("thing", THINGS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_body_into_every_kind_of_thing(kind, thing, how, speed):
+    """About 10 minutes."""
+    for wet in (True, False) if thing == "body" else (True,):
+        check_run(kind, thing, run(kind, thing, how, speed, wet))
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.02])
+def test_a_pendulum_swings_into_a_post_and_past_what_it_does_not_reach(dt):
+    """A beam hinged at its upper end falls from the horizontal: below its hinge it has sqrt(3 g L), 4.9 m/s."""
+    rod = {"density": 1e5, "young": 1e10, "supports": [{"where": "start", "fix": ["x", "y"]}]}
+    hinged = solid(beam([0.3, 0.8], [0.6, 0.8], 0.02, 2), **rod)
+    posts = {"near": {"shape": ball([0.3, 0.45], 0.04)}, "far": {"shape": ball([0.15, 0.6], 0.04)}}
+    table = {"dim": 2, "gravity": [0.0, -9.81], "time": {"end": 1.0, "dt": dt, "integrator": "bdf2"}}
+    fluid = {"density": 1.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [20, 20], "sides": {"top": "open"}}
+    table = scene_from_dict(table | {"fluid": fluid, "solids": {"rod": hinged}, "obstacles": posts})
+    with prepared(table, *LU) as sim, pytest.raises(TouchError) as error:
+        while not sim.finished:
+            sim.advance()
+    what, when = said(error.value)
+    assert what == "obstacles.far"
+    # from the horizontal to 45 degrees beyond the vertical, by the pendulum's own equation
+    assert 0.25 < when < 0.6
+
+
+def test_a_spinning_brick_meets_another_with_an_edge():
+    """It stands beside it, nearer than its diagonal: at a quarter of a turn a step its edge meets the other's face."""
+    spin = {"initial": {"velocity": ["-10*(y-0.1)", "10*(x-0.1)", 0.0]}}
+    one = solid(box([0.0, 0.0, 0.0], [0.2, 0.2, 0.2], [1, 1, 1]), **spin)
+    two = solid(box([0.22, -0.1, 0.0], [0.1, 0.4, 0.2], [1, 2, 1]))
+    table = scene({"one": one, "two": two}, 3, wet=False, dt=0.02)
+    with prepared(table, *LU) as sim, pytest.raises(TouchError) as error:
+        while not sim.finished:
+            sim.advance()
+    # half a diagonal, turned by a from 45 degrees: 0.1414 cos(pi/4 - a) = 0.12
+    what, when = said(error.value)
+    assert what == "solids.two" and when == pytest.approx(
+        (np.pi / 4 - np.arccos(0.12 / np.hypot(0.1, 0.1))) / 10, abs=4e-3
+    )

@@ -301,7 +301,7 @@ def test_two_rooms_on_the_sides_of_a_beam_have_a_pressure_in_common_that_it_does
         for _ in range(12):
             sim.advance()
             assert sim.outcome.residual < 1e-8
-        (unfelt,) = sim.regions._unfelt()
+        (unfelt,) = sim.regions.unfelt
         assert np.ptp(unfelt[unfelt != 0]) < 1e-12 * np.abs(unfelt).max()
         assert sim.fluid.volumes()[unfelt == 0].max(initial=0.0) == 0.0
 

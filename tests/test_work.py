@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
-from test_accounts import history, scene, simulation
+from test_accounts import fluid, history, scene, simulation
+from test_restart import STEPS, goes_on
 
+from petfsi.errors import SolveError
 from petfsi.fields.solid.elements import State
+from petfsi.integrators import INTEGRATORS
+from petfsi.scene.load import scene_from_dict
 
 OMEGA, WAY, PULL = 12.0, np.array([1e-3, -4e-4]), 5.0
 PERIOD = 2 * np.pi / OMEGA
@@ -190,3 +194,101 @@ def test_bdf2_loses_its_own_loss_under_whatever_drives_it(drive):
         change = rows[n + steps]["energy_residual"] - rows[n]["energy_residual"]
         np.testing.assert_allclose(change, -taken, rtol=1e-8)
     assert 0.01 < taken / rows[0]["kinetic"] < 1.0
+
+
+# ---- in a fluid ---------------------------------------------------------------------------------------------
+
+
+def paddle(steps, transfer):
+    """A block that its supports push through a closed box of water, little enough that no face opens or closes."""
+    push = {"where": "all", "fix": ["x", "y"], "displacement": {"x": "1e-6*t**3"}}
+    body = {
+        "shape": {"box": {"origin": [0.4, 0.3], "size": [0.2, 0.3], "cells": [2, 3]}},
+        "density": 800.0, "young": 1e5, "poisson": 0.3, "supports": [push],
+    }  # fmt: skip
+    return scene("bdf2", 1 / steps, transfer, fluid=fluid((10, 10)), solids={"block": body})
+
+
+def layer(steps, transfer):
+    """A layer between waters that are open above and below, pressed from above."""
+    rails = [{"where": side, "fix": ["x"]} for side in ("left", "right")]
+    body = {
+        "shape": {"box": {"origin": [0.0, 0.23], "size": [1.0, 0.2], "cells": [4, 3]}},
+        "density": 800.0, "young": 1e5, "poisson": 0.3, "supports": [*rails, {"where": "bottom", "fix": ["x", "y"]}],
+        "loads": [{"where": "top", "traction": [0.0, "0.1*(1 - cos(8*t))"]}],
+    }  # fmt: skip
+    water = fluid((4, 16), sides={"top": "open", "bottom": "open"})
+    return scene("bdf2", 1 / steps, transfer, fluid=water, solids={"layer": body})
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("make", [paddle, layer])
+@pytest.mark.parametrize("transfer", ["cutcell", "ray"])
+def test_what_drives_water_is_entered_to_second_order(transfer, make):
+    off = []
+    for steps in (10, 20):
+        got = history(make(steps, transfer), steps)
+        driven = np.abs(got["load_work" if make is layer else "boundary_work"]).max()
+        off.append(abs(got["energy_residual"][-1]) / driven)
+    assert np.log2(off[0] / off[1]) > 1.8 and off[1] < 0.01, off
+
+
+# ---- state --------------------------------------------------------------------------------------------------
+
+
+def everything(integrator):
+    """A plate and a beam with moving supports, loads that follow, and gravity that changes, in water but in statics."""
+    box = {"box": {"origin": [0.31, 0.32], "size": [0.3, 0.1], "cells": [4, 2]}}
+    common = {"density": 1500.0, "young": 1e5, "poisson": 0.3}
+    shaken = {"where": "left", "fix": ["x", "y"], "displacement": {"x": "0.01*sin(9*t)"}}
+    loads = [{"where": "top", "pressure": "300*t", "follower": True}, {"at": [0.61, 0.42], "force": ["20*t", 3.0]}]
+    blade = {"start": [0.4, 0.7], "end": [0.7, 0.7], "thickness": 0.05, "elements": 4}
+    swung = {"where": "start", "fix": ["x", "y", "angle"], "displacement": {"angle": "0.3*t*t"}}
+    solids = {
+        "plate": common | {"shape": box, "material": "neohookean", "supports": [shaken], "loads": loads},
+        "blade": common | {"shape": {"beam": blade}, "supports": [swung], "body_force": [0.0, "90*t"]},
+    }
+    data = scene(integrator, 0.01, gravity=["t", -0.5], solids=solids)
+    return data if integrator == "static" else data | {"fluid": fluid((20, 20))}
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("integrator", sorted(set(INTEGRATORS) - {"symplectic-euler"}))
+def test_work_goes_on_bit_for_bit(integrator):
+    data = everything(integrator)
+    data["time"] |= {"dt": "(1 + 0.4*sin(20*t))/100"}
+    sim = goes_on(scene_from_dict(data), "-options_file", "monolithic.opts", before=2, after=2)
+    assert all(sim.accounts.values[name] for name in ("potential", "load_work", "boundary_work"))
+
+
+@pytest.mark.parallel([1, 2])
+def test_explicit_work_goes_on_bit_for_bit():
+    data = everything("symplectic-euler")
+    del data["fluid"], data["solids"]["blade"]
+    data["time"] |= STEPS
+    sim = goes_on(scene_from_dict(data), before=2, after=2)
+    assert all(sim.accounts.values[name] for name in ("potential", "load_work", "boundary_work"))
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2"])
+def test_a_step_taken_again_in_halves_has_their_work(integrator):
+    short = everything(integrator)
+    short["time"]["dt"] = "0.01 - 0.005*(t > 0.005)"
+    with simulation(everything(integrator)) as whole, simulation(short) as halves:
+        for sim in (whole, halves, halves, halves):
+            sim.advance()
+        judge, failed = whole.solid.judge, []
+
+        def fails_once(x, dt):
+            if not failed:
+                failed.append(dt)
+                raise SolveError("not this time")
+            judge(x, dt)
+
+        whole.solid.judge = fails_once
+        whole.advance()
+        assert whole.substeps == 2 and whole.time == pytest.approx(halves.time)
+        got, wanted = whole.accounts.values, halves.accounts.values
+    for name in ("potential", "load_work", "boundary_work", "energy_residual"):
+        assert got[name] == pytest.approx(wanted[name], rel=1e-7, abs=1e-9 * abs(wanted["potential"])), name

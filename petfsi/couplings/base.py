@@ -72,6 +72,18 @@ class Coupling(ABC):
         """
         raise NotImplementedError
 
+    def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
+        """Return by unknown of the fluid what prescribed points let out in the step assembled, m^3/s (m^2/s in 2D).
+
+        None where there are no such points, on all ranks alike.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool, shape (n_points,), optional
+            Of some of the surface's points only.
+        """
+        return None
+
     @abstractmethod
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere, m^3/s (m^2/s in 2D), to the right sides that are assembled."""

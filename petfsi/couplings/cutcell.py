@@ -211,6 +211,13 @@ class CutCellCoupling(Coupling):
         """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
         return self._point_flux @ self.solid.surface_velocity().ravel()
 
+    def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
+        """Return by unknown of the fluid what prescribed points let out, of all or of some of them."""
+        if not self.surface.fixed_map.nnz:
+            return None
+        held = self._held if chosen is None else np.where(np.repeat(chosen, self.dim), self._held, 0.0)
+        return self._point_flux @ held
+
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the right sides. Collective."""
         self.fluid.rhs += self._pressed(volume)

@@ -61,7 +61,7 @@ class RayCoupling(Coupling):
         self._faces: list[rays.Hits] = []
         self._rows: list[Rows] = []
         self._stale, self._dt = False, 0.0
-        self._held_outflow = np.zeros(0)
+        self._held = self._held_outflow = np.zeros(0)
 
     def _take(self, surface: Surface) -> None:
         self.surface = surface
@@ -226,12 +226,20 @@ class RayCoupling(Coupling):
             self.n_assembled += 1
             self._stale, self._dt = False, dt
         if self.surface.fixed_map.nnz:
-            self._held_outflow = self._point_flux @ (self.surface.fixed_map @ self.solid.fixed_velocity())
+            self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
+            self._held_outflow = self._point_flux @ self._held
             self.fluid.rhs -= self._held_outflow
 
     def outflow(self) -> np.ndarray:
         """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
         return self._point_flux @ self.solid.surface_velocity().ravel()
+
+    def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
+        """Return by unknown of the fluid what prescribed points let out, of all or of some of them."""
+        if not self.surface.fixed_map.nnz:
+            return None
+        held = self._held if chosen is None else np.where(np.repeat(chosen, self.dim), self._held, 0.0)
+        return self._point_flux @ held
 
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the fluid's right side."""

@@ -291,6 +291,7 @@ class PressureFluid(FluidField):
         By unknown, what comes into cells from nowhere, m^3/s (m^2/s in 2D): ``assemble`` adds it to ``rhs``.
     """
 
+    dim: int
     n_cells: int
     fluxes: PETSc.Mat
     geometry_version: int = 0
@@ -325,6 +326,18 @@ class PressureFluid(FluidField):
         """Change the present velocity as the pressure x (SI) would in a first step of dt. Collective."""
 
     @abstractmethod
+    def inflows(self) -> dict[str, np.ndarray]:
+        """Return what ``inflow`` does by the key of each side that lets anything in. Not collective."""
+
+    @abstractmethod
+    def rehearse(self, time: float, dt: float) -> None:
+        """Give sides the velocities of a step of dt from ``time``, of none (0) those at that time. Collective."""
+
+    @abstractmethod
+    def place(self, member: np.ndarray) -> str:
+        """Return where some of the unknowns are, for people; they are those that are not zero here. Collective."""
+
+    @abstractmethod
     def cells_slab(self, values: np.ndarray) -> Slab:
         """Return a value per lasting unknown, shape (n_cells,), as a piece of a global array."""
 
@@ -338,6 +351,8 @@ class SolidField(Field):
 
     Attributes
     ----------
+    names : list of str
+        The bodies, in the order of the scene.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
@@ -349,6 +364,7 @@ class SolidField(Field):
     """
 
     elastic = True
+    names: list[str]
     extent: float
     moved: np.ndarray
     acting: tuple[str, ...] = ()
@@ -372,6 +388,17 @@ class SolidField(Field):
     def remark(self, dt: float) -> str | None:
         """Return what a user should know of the step of dt last accepted, each thing once. Collective."""
         return None
+
+    @abstractmethod
+    def predicted(self) -> float:
+        """Return how far off the farthest of this rank's nodes is where the step's equations are taken, m.
+
+        Between ``predict`` and ``accept``; along an axis.
+        """
+
+    @abstractmethod
+    def unheld(self) -> list[str]:
+        """Return what is wrong with bodies that nothing holds in statics, where the step is assembled. Collective."""
 
     @abstractmethod
     def stretch(self) -> float:

@@ -121,6 +121,11 @@ class JointSolid(SolidField):
         for part in self.parts:
             part.predict(time, dt)
 
+    def predicted(self) -> float:
+        """Return how far off the farthest of this rank's nodes is where the step's equations are taken, m."""
+        # what is no number counts most
+        return float(np.max([part.predicted() for part in self.parts]))
+
     def assemble(self, time: float, dt: float) -> None:
         """Refresh block (only if that of a part has changed) and right-hand side. Collective."""
         for part in self.parts:
@@ -190,6 +195,10 @@ class JointSolid(SolidField):
     def finest(self) -> float:
         """Length of the shortest edge of any part at rest, m. Collective at first."""
         return min(part.finest for part in self.parts)
+
+    def unheld(self) -> list[str]:
+        """Return what is wrong with bodies that nothing holds in statics. Collective."""
+        return [text for part in self.parts for text in part.unheld()]
 
     def stable_step(self) -> float:
         """Return the shortest of the parts' stable steps, s. Collective."""

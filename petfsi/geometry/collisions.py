@@ -62,7 +62,7 @@ def first_meeting(one: Way, other: Way) -> Meeting | None:
         return None
     place = np.zeros(one.start.shape[1])
     meetings = _MEETINGS_2D if len(place) == 2 else _MEETINGS_3D
-    ends = [[np.ascontiguousarray(x, dtype=float) for x in (way.start, way.end)] for way in (one, other)]
+    ends = [[_rows(x) for x in (way.start, way.end)] for way in (one, other)]
     part = _first_meeting(
         ends[0][0], ends[0][1], ends[1][0], ends[1][1], one.facets, other.facets, pairs, meetings, place
     )
@@ -86,8 +86,22 @@ def crossings(one: Way, other: Way) -> tuple[np.ndarray, np.ndarray]:
 
 def near_pairs(one: Way, other: Way) -> np.ndarray:
     """Return the pairs of facets whose boxes meet on their way, one of each surface, shape (k, 2)."""
-    ends = [[np.ascontiguousarray(x, dtype=float) for x in (way.start, way.end)] for way in (one, other)]
-    return _near_pairs(ends[0][0], ends[0][1], one.facets, ends[1][0], ends[1][1], other.facets)
+    n, dim = len(one.facets), one.start.shape[1]
+    low, high = np.empty((n + len(other.facets), dim)), np.empty((n + len(other.facets), dim))
+    bounds = []
+    for way, part in ((one, slice(n)), (other, slice(n, None))):
+        _boxes(_rows(way.start), _rows(way.end), way.facets, low[part], high[part])
+        bounds.append((low[part].min(axis=0, initial=np.inf), high[part].max(axis=0, initial=-np.inf)))
+    begin, end = np.maximum(bounds[0][0], bounds[1][0]), np.minimum(bounds[0][1], bounds[1][1])
+    kept = np.flatnonzero(np.all((low <= end) & (high >= begin), axis=1))
+    # along the axis along which boxes overlap least
+    crowd = (high[kept] - low[kept]).sum(axis=0) / np.maximum(end - begin, 1e-300)
+    axis = int(np.argmin(crowd))
+    return _sweep(low, high, n, axis, kept[np.argsort(low[kept, axis], kind="stable")])
+
+
+def _rows(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x, dtype=float)
 
 
 @njit(cache=True)
@@ -106,42 +120,15 @@ def any_within(points, facets, low, high):
 
 
 @njit(cache=True)
-def _near_pairs(start, end, facets, start_b, end_b, facets_b):
-    """Return the pairs of ``near_pairs``: boxes sorted along the axis along which they overlap least."""
-    dim, n = start.shape[1], len(facets)
-    low, high = np.empty((n + len(facets_b), dim)), np.empty((n + len(facets_b), dim))
-    begins, ends = _boxes(start, end, facets, low[:n], high[:n])
-    begins_b, ends_b = _boxes(start_b, end_b, facets_b, low[n:], high[n:])
-    begins, ends = np.maximum(begins, begins_b), np.minimum(ends, ends_b)
-    kept, k = np.empty(len(low), dtype=np.int64), 0
-    for i in range(len(low)):
-        meets = True
-        for a in range(dim):
-            meets = meets and low[i, a] <= ends[a] and high[i, a] >= begins[a]
-        if meets:
-            kept[k] = i
-            k += 1
-    kept = kept[:k]
-    axis, least = 0, np.inf
-    for a in range(dim):
-        crowd = np.sum(high[kept, a] - low[kept, a]) / max(ends[a] - begins[a], 1e-300)
-        if crowd < least:
-            axis, least = a, crowd
-    return _sweep(low, high, n, axis, kept[np.argsort(low[kept, axis])])
-
-
-@njit(cache=True)
 def _boxes(start, end, facets, low, high):
-    """Fill the corners of the box that each facet stays in, and return those of all of them."""
-    begins, ends = np.full(start.shape[1], np.inf), np.full(start.shape[1], -np.inf)
+    """Fill the corners of the box that each facet stays in."""
     for f in range(len(facets)):
         for a in range(start.shape[1]):
-            low[f, a], high[f, a] = np.inf, -np.inf
+            least, most = np.inf, -np.inf
             for i in facets[f]:
-                low[f, a] = min(low[f, a], min(start[i, a], end[i, a]))
-                high[f, a] = max(high[f, a], max(start[i, a], end[i, a]))
-            begins[a], ends[a] = min(begins[a], low[f, a]), max(ends[a], high[f, a])
-    return begins, ends
+                least = min(least, min(start[i, a], end[i, a]))
+                most = max(most, max(start[i, a], end[i, a]))
+            low[f, a], high[f, a] = least, most
 
 
 @njit(cache=True)
@@ -195,14 +182,16 @@ def _first_meeting(start, end, start_b, end_b, facets, facets_b, pairs, meetings
                         x[i, a] = (1.0 - t) * x0[i, a] + t * x1[i, a]
                 if _meet(x, corners):
                     first = t
-                    place[:] = x[corners[0]] if dim == 2 or not _are_edges(corners) else _on_edge(x, corners)
+                    s = _edge_weights(x, corners)[0] if _are_edges(corners) else 0.0
+                    for a in range(dim):
+                        place[a] = (1.0 - s) * x[corners[0], a] + s * x[corners[1], a]
                     break
     return first
 
 
 @njit(cache=True)
 def _are_edges(corners):
-    return corners[0] < 3 and corners[1] < 3
+    return len(corners) == 4 and corners[0] < 3 and corners[1] < 3
 
 
 @njit(cache=True)
@@ -289,15 +278,15 @@ def _bisected(b0, b1, b2, b3, low, high, at_low):
 def _meet(x, corners):
     """Whether points in one plane (line) are a point on a facet, or edges that meet."""
     if len(corners) == 3:
-        p, a, b = x[corners[0]], x[corners[1]], x[corners[2]]
-        along, length2 = np.dot(p - a, b - a), np.dot(b - a, b - a)
+        p, a, b = corners[0], corners[1], corners[2]
+        along, length2 = _dot(x, p, a, b, a), _dot(x, b, a, b, a)
         return -BEYOND * length2 <= along <= (1.0 + BEYOND) * length2
     if _are_edges(corners):
         s, t = _edge_weights(x, corners)
         return -BEYOND <= s <= 1.0 + BEYOND and -BEYOND <= t <= 1.0 + BEYOND
-    p, a, b, c = x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]]
-    e, g, r = b - a, c - a, p - a
-    ee, eg, gg, re, rg = np.dot(e, e), np.dot(e, g), np.dot(g, g), np.dot(r, e), np.dot(r, g)
+    p, a, b, c = corners[0], corners[1], corners[2], corners[3]
+    ee, eg, gg = _dot(x, b, a, b, a), _dot(x, b, a, c, a), _dot(x, c, a, c, a)
+    re, rg = _dot(x, p, a, b, a), _dot(x, p, a, c, a)
     det = ee * gg - eg * eg
     s, t = gg * re - eg * rg, ee * rg - eg * re
     return det > 0.0 and s >= -BEYOND * det and t >= -BEYOND * det and s + t <= (1.0 + BEYOND) * det
@@ -306,9 +295,9 @@ def _meet(x, corners):
 @njit(cache=True)
 def _edge_weights(x, corners):
     """Return where on the lines of two edges they are nearest, 0 to 1 on the edges; beyond if they are parallel."""
-    p, q, r, s = x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]]
-    e, g, w = q - p, s - r, p - r
-    ee, eg, gg, we, wg = np.dot(e, e), np.dot(e, g), np.dot(g, g), np.dot(w, e), np.dot(w, g)
+    p, q, r, s = corners[0], corners[1], corners[2], corners[3]
+    ee, eg, gg = _dot(x, q, p, q, p), _dot(x, q, p, s, r), _dot(x, s, r, s, r)
+    we, wg = _dot(x, p, r, q, p), _dot(x, p, r, s, r)
     det = ee * gg - eg * eg
     if det <= PARALLEL**2 * ee * gg:
         return -1.0, -1.0
@@ -316,9 +305,12 @@ def _edge_weights(x, corners):
 
 
 @njit(cache=True)
-def _on_edge(x, corners):
-    s, _ = _edge_weights(x, corners)
-    return (1.0 - s) * x[corners[0]] + s * x[corners[1]]
+def _dot(x, a, b, c, d):
+    """Return (x_a - x_b) . (x_c - x_d)."""
+    total = 0.0
+    for k in range(x.shape[1]):
+        total += (x[a, k] - x[b, k]) * (x[c, k] - x[d, k])
+    return total
 
 
 # ---- where they stand ---------------------------------------------------------------------------------------
@@ -337,22 +329,32 @@ def _crossings_2d(one, other, pairs, crosses):
 @njit(cache=True)
 def _crossings_3d(one, other, pairs, crosses):
     """Mark pairs of triangles (n, 3, 3) of which an edge of one goes through the other."""
+    x = np.empty((6, 3))
     for k in range(len(pairs)):
-        f, g = one[pairs[k, 0]], other[pairs[k, 1]]
+        x[:3], x[3:] = one[pairs[k, 0]], other[pairs[k, 1]]
         for i in range(3):
             j = (i + 1) % 3
-            crosses[k] = crosses[k] or _pierces(f[i], f[j], g) or _pierces(g[i], g[j], f)
+            crosses[k] = crosses[k] or _pierces(x, i, j, 3) or _pierces(x, 3 + i, 3 + j, 0)
 
 
 @njit(cache=True)
-def _pierces(p, q, triangle):
-    """Whether the edge from p to q goes through a triangle."""
-    e, g = triangle[1] - triangle[0], triangle[2] - triangle[0]
-    normal = np.cross(e, g)
-    if np.dot(normal, p - triangle[0]) * np.dot(normal, q - triangle[0]) >= 0.0:
+def _pierces(x, p, q, first):
+    """Whether the edge from p to q goes through the triangle of the points from ``first``."""
+    if _side(x, first, first + 1, first + 2, p) * _side(x, first, first + 1, first + 2, q) >= 0.0:
         return False
-    way, positive, negative = q - p, True, True
+    positive, negative = True, True
     for i in range(3):
-        turn = np.dot(way, np.cross(triangle[i] - p, triangle[(i + 1) % 3] - p))
+        turn = _side(x, p, q, first + i, first + (i + 1) % 3)
         positive, negative = positive and turn > 0.0, negative and turn < 0.0
     return positive or negative
+
+
+@njit(cache=True)
+def _side(x, a, b, c, d):
+    """Return det(x_b - x_a, x_c - x_a, x_d - x_a)."""
+    total = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        cross = (x[c, i] - x[a, i]) * (x[d, j] - x[a, j]) - (x[c, j] - x[a, j]) * (x[d, i] - x[a, i])
+        total += (x[b, k] - x[a, k]) * cross
+    return total

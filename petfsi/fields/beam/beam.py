@@ -74,6 +74,10 @@ class BeamSolid(NodalSolid):
         theory = next(iter(self._beams.values())).theory
         return BeamElements(self._mesh.points, self._mesh.cells, self._mesh.body, self._sections(solids), theory)
 
+    def _stiffens(self, body: int) -> bool:
+        """Return whether its theory knows of turning."""
+        return self._mesh.cells.shape[1] > 2
+
     def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the axis' segments between nodes, of beams that may turn as far as they like, and EA/2.
 

@@ -25,6 +25,7 @@ from petfsi.ranks import agreed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression, evaluate_at
 from petfsi.scene.schema import Scene
+from petfsi.scene.side_notes import side_notes
 from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class MacFluid(CoveredGrid):
         self._extra_pressure = np.zeros(0)
         self._other_pressure: np.ndarray | None = None
         self._forces: budget.Forces | None = None
+        self._weighed = True  # no step has pushed anything yet
         self._bands = [Band(grid, axis) for axis in self._axes]
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
@@ -148,6 +150,8 @@ class MacFluid(CoveredGrid):
     def _divide(self, parts: Parts, old_kind: list[np.ndarray], other: np.ndarray) -> None:
         """Let divided faces and cells go on with what those had that they come from. Collective."""
         old, grid = self.sheets, self.grid
+        if self.surroundings.has_jets:  # what is open of a face may be so to a jet or not
+            self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         self.sheets = self._sheets_of(parts)
         self._transport.advection.sheets = self.sheets
         if old is None:
@@ -184,8 +188,9 @@ class MacFluid(CoveredGrid):
 
     def _sheets_of(self, parts: Parts) -> Sheets:
         assert self.narrow is not None
-        behind = self.surroundings.behind_jets
-        return Sheets(self.grid, parts, self.face_kind, self.narrow, self.cell_kind, behind)
+        around = self.surroundings
+        narrow = around.not_read(self.narrow)
+        return Sheets(self.grid, parts, self.face_kind, narrow, self.cell_kind, around.behind_jets)
 
     def _go_on(self, lineage: Lineage) -> None:
         """Take over velocities and smoke of the former parts. Collective."""
@@ -222,15 +227,18 @@ class MacFluid(CoveredGrid):
         self._remember("smoke", "_extra_pressure", "velocity", "smoke_parts", "sheets")
         transport = self._transport
         transport.remember()
-        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         moment, smoke, further = transport.moment(dt), self.smoke, self.smoke_parts
+        self.surroundings.evaluate(time + moment)
+        if self.surroundings.carries_along:
+            for faces in transport.read():
+                self.surroundings.fill_along(faces)
+        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         if self.smoke is not None and self._smoke_band is not None:
             old, parts = self.smoke, self.smoke_parts
             self.smoke, self.smoke_parts = transport.carry_smoke(old, parts, self._smoke_band.layer != FAR, dt)
             self._complete_cells(self.smoke)
             smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
             further = self.smoke_parts if moment == dt else parts + moment / dt * (self.smoke_parts - parts)
-        self.surroundings.evaluate(time + moment)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         self._add_forces(time + moment, transport.factor(dt), smoke, further)
 
@@ -245,6 +253,8 @@ class MacFluid(CoveredGrid):
         heavy = [self.weight is None or p for p in self.grid.periodic]
         self._forces = forces = budget.Forces.of(gravity, heavy, buoyancy, smoke, link_smoke)
         before = None if local is None else local.at_faces(self.velocity_star)
+        self.open_sides.evaluate(time, gravity)
+        self.open_sides.push(self.velocity_star, self.face_kind, duration)
         if self.weight is not None:
             self.weight.at(time)
             self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
@@ -267,6 +277,7 @@ class MacFluid(CoveredGrid):
                 self._part(axis),
             )
             self.grid.exchange_faces(axis, star, width=1)
+        self._weighed = not self.open_sides.total
 
     def assemble(self, time: float, dt: float) -> None:
         """Refresh L if the geometry or the step changed, the right-hand side and the scales. Collective."""
@@ -274,6 +285,11 @@ class MacFluid(CoveredGrid):
         dx = grid.cell_volume ** (1.0 / self.dim)
         self.row_scale, self.col_scale = 1.0 / dx ** (self.dim - 1), self.density * dx / dt
         factor = self.factor(dt)
+        if not self._weighed:  # the cells are cut as this step sees them by now
+            table = None if self.sheets is None else self.sheets.table
+            carried = self._transport.carried
+            self.open_sides.weigh(carried, self.velocity_star, self.face_kind, factor, table)
+            self._weighed, self._assembled_for = True, None
         if self._assembled_for != (self.geometry_version, factor):
             self._assemble_block(factor)
         self.rhs[:] = -self._outflow(self.velocity_star)
@@ -298,6 +314,38 @@ class MacFluid(CoveredGrid):
         if not self.surroundings.has_jets:
             return None
         return -self._outflow(each(np.zeros_like, self.velocity_star))
+
+    def inflows(self) -> dict[str, np.ndarray]:
+        """Return by unknown what each side with jets lets in. Not collective."""
+        found: dict[str, np.ndarray] = {}
+        given, still = self.boundary_velocity, each(np.zeros_like, self.velocity_star)
+        for key in self.surroundings.jet_keys:
+            self.boundary_velocity = [np.zeros_like(v) for v in given]
+            self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity, key)
+            found[key] = -self._outflow(still)
+        self.boundary_velocity = given
+        return found
+
+    def rehearse(self, time: float, dt: float) -> None:
+        """Give jets the velocities that they have in a step from ``time``. Collective."""
+        self.surroundings.evaluate(time + self._transport.moment(dt))
+        self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
+
+    def place(self, member: np.ndarray) -> str:
+        """Return the box around the cells of some unknowns. Collective."""
+        cells, shape = member[: self.n_cells] != 0.0, self.grid.shape(None)
+        ends = np.full((2, self.dim), -np.inf)
+        for a in self._axes:
+            centres = np.broadcast_to(self.grid.coordinates(None)[a], shape)
+            x = self.grid.to_vec(centres)[cells]
+            if self.extras is not None:
+                x = np.append(x, centres.reshape(-1)[self.extras.cell][member[self.n_cells :] != 0.0])
+            if len(x):
+                ends[:, a] = self.grid.dx[a] / 2 + np.array([x.max(), -x.min()])
+        high, low = self.comm.allreduce(ends, op=np.maximum)
+        return (
+            ", ".join(f"{axis} {0.0 - b:.4g} to {e:.4g}" for axis, b, e in zip("xyz", low, high, strict=False)) + " m"
+        )
 
     def rhs_round_off(self) -> float:
         """Return eps ||A v*||: net outflows are differences of what goes in and out. Collective."""
@@ -356,12 +404,14 @@ class MacFluid(CoveredGrid):
                 self._part(axis),
                 solved[axis],
             )
+        if self.open_sides.total:
+            self.open_sides.relax(solved, star, self.face_kind)
         if self.extras is not None:
             assert self.sheets is not None
             local, extras, n_cells = self.sheets.local, self.extras, grid.layout.n_local
             parts = extras.project(
                 star.parts, x[n_cells:], self.layout.start + n_cells, p, self.index,
-                factor / (self.density * grid.dx), self.comm,
+                factor / (self.density * grid.dx), self.comm, self.open_sides.link_yields,
             )  # fmt: skip
             solved.parts = local.gathered(parts, extras.row[extras.owned])
             local.mean_into(solved, solved.parts)
@@ -391,12 +441,13 @@ class MacFluid(CoveredGrid):
             self.grid.fill_sides(known, axis)
             extended.append(known)
         new = Faces(extended, faces.parts)
-        if self.sheets is None or not self.sheets.anywhere:
-            return new
-        # a band takes both sides; and what is narrow now may be read as it is in the next step
-        new = self.sheets.renew_faces(new, self.sheets.slim)
-        for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
-            np.copyto(v, known, where=slit & slim)
+        if self.sheets is not None and self.sheets.anywhere:
+            # a band takes both sides; and what is narrow now may be read as it is in the next step
+            new = self.sheets.renew_faces(new, self.sheets.slim)
+            for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
+                np.copyto(v, known, where=slit & slim)
+        if self.surroundings.carries_along:
+            self.surroundings.fill_along(new)
         return new
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
@@ -406,6 +457,11 @@ class MacFluid(CoveredGrid):
         self.surroundings.fill_smoke(smoke)
 
     # ---- observation ------------------------------------------------------------------------------------------
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of the sides."""
+        return side_notes(self.scene)
 
     def cfl(self, dt: float) -> float:
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
@@ -473,8 +529,8 @@ class MacFluid(CoveredGrid):
                 forces = replace(forces, link_smoke=now)
             gravity = budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
         into = budget.inflow(
-            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.extras,
-            self._extra_pressure,
+            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.surroundings,
+            self.open_sides, self.extras, self._extra_pressure,
         )  # fmt: skip
         return Work(gravity=gravity, boundary=into)
 

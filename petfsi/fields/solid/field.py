@@ -11,10 +11,12 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from petfsi.errors import InputError
 from petfsi.fields.base import Forces, Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
+from petfsi.fields.solid.loose import RigidMotion, loose_motions, refusal
 from petfsi.fields.solid.lumped import LumpedEquation
 from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, distribute, slab
@@ -32,6 +34,11 @@ from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Number
+
+#: The least mass that rows can be measured against, kg; of the greatest the inverse.
+LIGHTEST = 1e-150
+#: What is left of forces that cancel, as a part of them.
+UNPUSHED = 1e-9
 
 
 class NodalSolid(SolidField):
@@ -89,7 +96,7 @@ class NodalSolid(SolidField):
         self._elements = self._make_elements(solids)
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
         self._uniform = self._elements.uniform_load(n_owned)
-        self._reference_mass = comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points)
+        self.set_scale(comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points))
 
         self._tags = on_root(comm, lambda: _tags(scene, solids, mesh))
         self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
@@ -99,6 +106,8 @@ class NodalSolid(SolidField):
         self._loads = self._make_loads(mesh, solids)
         self.is_linear = self._elements.constant and not (self._loads is not None and self._loads.follow)
         self._set_exchange(mesh)
+        # where there is no inertia, what nothing holds is looked for
+        self._whole = None if np.isfinite(self._integrator.factor(1.0, 0.0)) else mesh
         self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
         self._set_turning(mesh)
 
@@ -139,6 +148,10 @@ class NodalSolid(SolidField):
         held[self._supports.still] = True
         still = held[self.layout.start : self.layout.end].reshape(-1, self.width)[:, : self.dim]
         self._turning = Turning(self.comm, self._mesh, parts, bodies_of(mesh)[mine], still, mass, self._with_shared)
+
+    def _stiffens(self, body: int) -> bool:
+        """Return whether loads that do not follow it may hold a body in its place as it turns."""
+        return False
 
     @abstractmethod
     def near_null_space(self) -> list[np.ndarray]:
@@ -237,6 +250,11 @@ class NodalSolid(SolidField):
         if added is not None:
             self._stage = moved(self._stage, added)
         self._geometry = self._stage.tangent_at
+
+    def predicted(self) -> float:
+        """Return how far off the farthest of this rank's nodes is where the step's equations are taken, m."""
+        there = self.displacement if self._geometry is None else self._geometry
+        return float(np.abs(self.along_axes(there - self.displacement)).max(initial=0.0))
 
     def assemble(self, time: float, dt: float) -> None:
         """Refresh A (only if it changes) and b for the step from ``time`` to ``time + dt``. Collective."""
@@ -340,6 +358,36 @@ class NodalSolid(SolidField):
         """Forget the step begun."""
         self._stage = self._geometry = None
 
+    def unheld(self) -> list[str]:
+        """Return what is wrong with bodies that nothing holds in statics, where the step is assembled. Collective."""
+        if self._whole is None:
+            return []
+        mesh, held = self._whole, np.zeros(self.layout.n_global, dtype=bool)
+        held[self._supports.unknowns] = True
+        held = held.reshape(-1, self.width)[self._number]
+        d, force = (
+            np.concatenate(self.comm.allgather(owned))[self._number]
+            for owned in (self.displacement[:, : self.dim], self.rhs.reshape(-1, self.width))
+        )
+        force[held] = 0.0
+        found: dict[int, list[tuple[RigidMotion, float]]] = {}
+        wrong = []
+        for motion in loose_motions(mesh, mesh.points + d, held):
+            push, steadies = self._pushed(motion, force[motion.nodes])
+            found.setdefault(motion.body, []).append((motion, push))
+            if push or not steadies:
+                wrong.append(motion.body)
+        return [refusal(self.names[body], found[body], self.dim) for body in dict.fromkeys(wrong)]
+
+    def _pushed(self, motion: RigidMotion, force: np.ndarray) -> tuple[float, bool]:
+        """Return the work of nodal forces (n, width) along a motion, and whether they hold the body as it turns."""
+        works, curved = force * motion.values, force[:, : self.dim] * motion.centripetal
+        push = float(works.sum())
+        follow = self._loads is not None and self._loads.follow
+        steadies = bool(np.any(curved)) and (follow or self._stiffens(motion.body))
+        steadies = steadies and (follow or abs(float(curved.sum())) > UNPUSHED * float(np.abs(curved).sum()))
+        return (push if abs(push) > UNPUSHED * float(np.abs(works).sum()) else 0.0), steadies
+
     def stable_step(self) -> float:
         """Return the longest stable step of an explicit scheme at the present displacement, s. Collective."""
         if self._lumped is None:
@@ -418,7 +466,15 @@ class NodalSolid(SolidField):
         return self._reference_mass
 
     def set_scale(self, reference_mass: float) -> None:
-        """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``."""
+        """Measure rows against this mass (kg) rather than the mean nodal mass: ``row_scale = dt / mass``.
+
+        Raises
+        ------
+        InputError
+            If numbers cannot hold it, or what is divided by it.
+        """
+        if not LIGHTEST < reference_mass < 1 / LIGHTEST:
+            raise InputError(f"a node or cell of {reference_mass:g} kg is too light or too heavy; look at densities")
         self._reference_mass = reference_mass
 
     def _mean_diagonal(self, stage: Stage) -> float:

@@ -50,6 +50,10 @@ class SimplexSolid(NodalSolid):
         self._turns = np.array([solid.material != "linear" for solid in solids.values()])
         return Elements(self._mesh, _bodies(solids))
 
+    def _stiffens(self, body: int) -> bool:
+        """Return whether its material knows of turning."""
+        return bool(self._turns[body])
+
     def _turning_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the cells of bodies whose material does not mind being turned, and 2 (lambda + mu)."""
         use = self._turns[self._mesh.body]
