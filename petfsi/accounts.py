@@ -8,9 +8,14 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.couplings.base import Coupling
-from petfsi.fields.base import Field, Reader, Slab, scalar_slab
+from petfsi.fields.base import Field, Reader, Slab, SolidField, Work, scalar_slab
+from petfsi.force_work import ForceWork
+from petfsi.integrators import INTEGRATORS
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
+
+#: The columns that are summed over steps.
+SUMMED = ("potential", "dissipated", "load_work", "boundary_work")
 
 
 class Accounts:
@@ -31,21 +36,25 @@ class Accounts:
         Energy stored in the solids, and in the compression of particles.
     ``potential``
         Minus the work of gravity so far: on the solids' mass along the way it went, and on the fluid. Cut cells:
-        through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f dt.
+        through the walls that solids move, -int N_i n rho g . (x - x_0) dA along the same way. Ray: m_f g . v_f.
     ``dissipated``
-        What Rayleigh damping took so far, sum w . C w dt, with w where the integrator takes the forces; and
-        of particles their viscosity, the diffusion of density, and shifting as far as it lowered their weight.
+        What Rayleigh damping took so far, w . C w; and of particles their viscosity, the diffusion of density, and
+        shifting as far as it lowered their weight.
     ``load_work``
         Of the solids' body forces and loads so far, along the way that nodes moved.
     ``boundary_work``
-        What came in so far: the supports' reactions, the residual of their equations, times w dt; through inflows
-        and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times the flow; and
-        with what closes the volume of regions, pressure times that. Of particles the work of sides that move, and the
-        energy of all that came and left, with what is done on them beyond sides.
+        What came in so far: the supports' reactions, the residual of their equations, along the way of their nodes;
+        through inflows and open sides (pressure + kinetic energy + with cut cells potential energy) per volume, times
+        the flow; and with what closes the volume of regions, pressure times that. Of particles the work of sides that
+        move, and the energy of all that came and left, with what is done on them beyond sides.
     ``energy_residual``
         kinetic + elastic + potential + dissipated - load_work - boundary_work, less its initial value: what the
         scheme's own damping took (negative) or gave, with advection, cuts that change and what linearising a step
-        leaves out. With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions.
+        leaves out. With ``midpoint`` and cut cells it vanishes to the solver's tolerance for small motions. In statics
+        it is what loads set free that the state at the start does not bear.
+
+    Forces times a way go through ``ForceWork``, powers through the trapezoidal rule, of ``midpoint`` through its own:
+    both are of second order. The power before the first step is that of the first step.
 
     Columns that a scene has no use for are left out, all of them if ``output.accounts`` is false.
 
@@ -76,6 +85,10 @@ class Accounts:
         self._loaded = any(solid.loads or solid.body_force for solid in scene.solids.values())
         self._initial = 0.0
         self._sums = np.zeros(4)
+        integrator = INTEGRATORS[scene.time.integrator]()
+        self._solid = ForceWork(next((f for f in fields if isinstance(f, SolidField)), None), couplings, integrator)
+        self._centred = 0.0 < integrator.moment(1.0) < 1.0
+        self._power: np.ndarray | None = None  # of the step before
         self.values: dict[str, float] = {}
 
     @property
@@ -88,7 +101,9 @@ class Accounts:
         if self._wanted:
             self._sums[:] = 0.0
             self._initial = 0.0
-            self._enter(np.zeros(4))
+            self._enter(np.zeros(8), 0.0)
+            self._power = None
+            self._solid.start()
             self._initial = self.values["energy_residual"]
             self.values["energy_residual"] = 0.0
 
@@ -103,21 +118,27 @@ class Accounts:
         """
         if not self.values:
             return
-        parts = [field.work(dt) for field in self.fields]
-        of_nothing = np.zeros(0)
-        parts += [coupling.work(of_nothing if pressure is None else pressure, dt) for coupling in self.couplings]
-        self._enter(np.array([(-part.gravity, part.damping, part.loads, part.boundary) for part in parts]).sum(axis=0))
+        solution = np.zeros(0) if pressure is None else pressure
+        works = [Work(**self._solid.step())]
+        works += [field.work(dt) for field in self.fields]
+        works += [coupling.work() for coupling in self.couplings]
+        powers = [field.power() for field in self.fields]
+        powers += [coupling.power(solution) for coupling in self.couplings]
+        self._enter(np.concatenate((_summed(works), _summed(powers))), dt)
 
-    def _enter(self, done: np.ndarray) -> None:
-        """Add up this rank's shares: what was done in a step, and what the fields hold. Collective."""
+    def _enter(self, done: np.ndarray, dt: float) -> None:
+        """Add up this rank's shares: what was done in a step, the powers, and what the fields hold. Collective."""
         stocks = [field.stock() for field in self.fields]
         share = np.concatenate([done, *([s.kinetic, s.elastic] for s in stocks), *(s.momentum for s in stocks)])
         total = np.empty_like(share)
         self.comm.Allreduce(share, total)
-        self._sums += total[:4]
+        power = total[4:8]
+        before = power if self._power is None or self._centred else self._power
+        self._sums += total[:4] + dt / 2 * (before + power)
+        self._power = power
         n = len(stocks)
-        kinetic, elastic = total[4 : 4 + 2 * n].reshape(n, 2).sum(axis=0).tolist()
-        momentum = total[4 + 2 * n :].reshape(n, self.dim).sum(axis=0)
+        kinetic, elastic = total[8 : 8 + 2 * n].reshape(n, 2).sum(axis=0).tolist()
+        momentum = total[8 + 2 * n :].reshape(n, self.dim).sum(axis=0)
         self._write(kinetic, elastic, momentum)
 
     def _write(self, kinetic: float, elastic: float, momentum: np.ndarray) -> None:
@@ -139,13 +160,27 @@ class Accounts:
         self.values["energy_residual"] = held - self._initial
 
     def state(self) -> dict[str, Slab]:
-        """Return the present row, and where it began."""
-        numbers = self.values | {"initial_energy": self._initial}
-        return {name: scalar_slab(self.comm, value) for name, value in numbers.items()}
+        """Return the present row, where it began, and what the next one reads. Collective."""
+        power = self._power
+        numbers = self.values | {"initial_energy": self._initial, "began": float(power is not None)}
+        if power is not None:
+            numbers |= {f"power_{name}": value for name, value in zip(SUMMED, power.tolist(), strict=True)}
+        return {name: scalar_slab(self.comm, value) for name, value in numbers.items()} | self._solid.state()
 
     def restore(self, read: Reader) -> None:
         """Take up a state, after ``start``. Collective."""
-        self.values = {name: float(read(name, (0,), (1,))[0]) for name in self.values}
-        self._initial = float(read("initial_energy", (0,), (1,))[0])
-        summed = ("potential", "dissipated", "load_work", "boundary_work")
-        self._sums[:] = [self.values.get(name, 0.0) for name in summed]
+
+        def number(name: str) -> float:
+            return float(read(name, (0,), (1,))[0])
+
+        self.values = {name: number(name) for name in self.values}
+        self._initial = number("initial_energy")
+        self._sums[:] = [self.values.get(name, 0.0) for name in SUMMED]
+        began = number("began") > 0
+        self._power = np.array([number(f"power_{name}") for name in SUMMED]) if began else None
+        self._solid.restore(read, began)
+
+
+def _summed(works: Sequence[Work]) -> np.ndarray:
+    """Return the sums by ``SUMMED``."""
+    return np.array([(-work.gravity, work.damping, work.loads, work.boundary) for work in works]).sum(axis=0)

@@ -19,5 +19,13 @@ class SolveError(PetfsiError):
     exit_code = 3
 
 
-class NoSolutionError(SolveError):
-    """The equations of a step have no solution, whatever its length: it is not tried again."""
+class FinalError(SolveError):
+    """What no shorter step helps: it is not tried again."""
+
+
+class TouchError(FinalError):
+    """Things meet that do not push each other off."""
+
+
+class NoSolutionError(FinalError):
+    """The equations of a step have no solution, whatever its length."""

@@ -369,8 +369,8 @@ class SymplecticEuler:
         return 0.0
 
     def instants(self, h: float) -> tuple[float, ...]:
-        """Return the end of the step."""
-        return (h,)
+        """Return both ends: w is the velocity in the middle of the step."""
+        return (0.0, h)
 
     def stride(self, stage: Stage, h: float) -> float:
         """Return h."""

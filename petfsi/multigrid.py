@@ -1,17 +1,24 @@
 """Geometric multigrid for the pressure: what carries vectors between grids, and the operators of coarse grids.
 
-Cells are merged by twos along every axis. With Q the piecewise constant and P the (bi-, tri-) linear interpolation
-between cell centres, level by level,
+Cells are merged by twos along the axes of the shortest spacing: along all where cells are about as long as wide, else
+first along those that couple them most, until they are. The point smoother then does at any ratio. With Q the piecewise
+constant and P the (bi-, tri-) linear interpolation between cell centres, level by level,
 
     corrections   x += P x_c             with P handed to PCMG,
     fluxes        L_c = Q^T L Q / 2      open parts of faces are averaged, the distance between centres doubles,
     walls         E_c = Q^T E Q          what moving walls let through (see ``schur``) adds up.
 
 Coarse operators keep the 5 or 7 points of L, so they cost next to nothing to make and to apply, and the cycle is
-symmetric and positive whatever the geometry. Where only some axes can still be halved, L_c and E_c are P^T . P.
+symmetric and positive whatever the geometry. Where only some axes are halved, L_c and E_c are P^T . P.
+
+Where cells are merged along their short side only, walls are soon too thin for the grid, and what they part, column by
+column, is as good as unconnected otherwise. If there are walls in a stretched grid, the second level is therefore the
+first one again, with L + E as its operator, and solved by a cycle of algebraic multigrid (see ``preconditioners``).
 
 References
 ----------
+W. A. Mulder, A new multigrid approach to convection problems, Journal of Computational Physics 83 (1989): merging
+along some axes.
 M. Mohr and R. Wienands, Cell-centred multigrid revisited, Computing and Visualization in Science 7 (2004).
 """
 
@@ -28,14 +35,19 @@ from petsc4py import PETSc
 from petfsi import petsc
 from petfsi.errors import InputError
 from petfsi.petsc import IntType, Layout
+from petfsi.preconditioners import LastLevel
 from petfsi.resisted import Resisted
 from petfsi.smoothers import Walls
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.fluid import MacFluid
 
-#: Axes are halved while they have more cells than this.
+#: Grids are coarsened while they have more cells than this along an axis.
 COARSEST = 4
+#: An axis is halved while its spacing is below this times the shortest one: then they come as near as they can.
+SIMILAR = 2.0**0.5
+#: Ratio of spacings from which on walls want algebraic multigrid.
+STRETCHED = 4.0
 
 
 @dataclass(frozen=True)
@@ -47,21 +59,33 @@ class Lattice:
     bounds : list of ndarray
         Per axis the first cell of each rank along it, and the number of cells.
     periodic : tuple of bool
+    spacing : tuple of float
+        Distance of neighbours per axis, in any unit.
     """
 
     bounds: list[np.ndarray]
     periodic: tuple[bool, ...]
+    spacing: tuple[float, ...]
 
     @property
     def cells(self) -> tuple[int, ...]:
         """Cells per axis."""
         return tuple(int(b[-1]) for b in self.bounds)
 
+    @property
+    def merged(self) -> tuple[bool, ...]:
+        """Whether the next level has half as many cells, per axis."""
+        sides = list(zip(self.spacing, self.cells, strict=True))
+        shortest = min((h for h, n in sides if n > 1), default=0.0)
+        return tuple(n > 1 and h < SIMILAR * shortest for h, n in sides)
+
     def halved(self) -> Lattice:
         """Return the next level; a rank keeps the coarse cells whose first cell is its own."""
+        halves = self.merged
         return Lattice(
-            [(b + 1) // 2 if b[-1] > COARSEST else b for b in self.bounds],
+            [(b + 1) // 2 if half else b for b, half in zip(self.bounds, halves, strict=True)],
             self.periodic,
+            tuple(2 * h if half else h for h, half in zip(self.spacing, halves, strict=True)),
         )
 
     def sizes(self) -> np.ndarray:
@@ -128,9 +152,8 @@ class Transfer:
 def _pairs(fine: Lattice, owned: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return ``line_weights`` of a rank's cells per axis; an axis that stays carries over as it is."""
     lines = []
-    for b, i, periodic in zip(fine.bounds, owned, fine.periodic, strict=True):
-        n = int(b[-1])
-        lines.append(tuple(w[i] for w in line_weights(n, periodic)) if n > COARSEST else (i, i, np.zeros(len(i))))
+    for n, i, periodic, merged in zip(fine.cells, owned, fine.periodic, fine.merged, strict=True):
+        lines.append(tuple(w[i] for w in line_weights(n, periodic)) if merged else (i, i, np.zeros(len(i))))
     return lines
 
 
@@ -140,7 +163,9 @@ class Hierarchy:
     Attributes
     ----------
     transfers : list of Transfer
-        From the finest level on.
+        From the finest level on; at least one.
+    walled : bool
+        Whether the cells are long and there are walls among them.
     """
 
     def __init__(self, fluid: MacFluid) -> None:
@@ -149,12 +174,13 @@ class Hierarchy:
         for axis in range(grid.dim):
             lows = sorted(set(self.comm.allgather(grid.lo[axis])))
             bounds.append(np.array([*lows, grid.cells[axis]]))
-        self._lattice = Lattice(bounds, grid.periodic[: grid.dim])
+        self._lattice = Lattice(bounds, grid.periodic[: grid.dim], tuple(grid.dx))
+        self.walled = bool(fluid.scene.obstacles or fluid.scene.solids) and max(grid.dx) >= STRETCHED * min(grid.dx)
         self.transfers: list[Transfer] = []
         self._layout: Layout | None = None
         self._extra_cells = np.zeros(0, dtype=np.int64)
         level, fine = self._lattice, self._lattice.layout(self.comm.rank)
-        while max(level.cells) > COARSEST:
+        while not self.transfers or max(level.cells) > COARSEST:
             self.transfers.append(self._transfer(level, fine, np.zeros(0, dtype=np.int64)))
             level = level.halved()
             fine = level.layout(self.comm.rank)
@@ -169,7 +195,7 @@ class Hierarchy:
             inner = [p - g for p, g in zip(place, grid.ghost, strict=True)]
             cells = np.ravel_multi_index(inner[: grid.dim], grid.owned_shape[: grid.dim], order="F")
         same = self._layout == fluid.layout and np.array_equal(cells, self._extra_cells)
-        if not self.transfers or not self.comm.allreduce(not same) and self._layout is not None:
+        if not self.comm.allreduce(not same) and self._layout is not None:
             return
         if self._layout is not None or fluid.extras is not None:
             self.transfers[0] = self._transfer(self._lattice, fluid.layout, cells)
@@ -187,7 +213,7 @@ class Hierarchy:
         return Transfer(
             linear.matrix(self.comm, rows, columns, parents),
             constant.matrix(self.comm, rows, columns, parents),
-            regular=min(fine.cells) > COARSEST,
+            regular=all(fine.merged),
         )
 
 
@@ -253,10 +279,13 @@ class Multigrid:
         options = PETSc.Options(pc.getOptionsPrefix())
         available = len(hierarchy.transfers) + 1
         levels = options.getInt("pc_mg_levels", available)
-        if not 1 <= levels <= available:
+        if not 2 <= levels <= available:
             name = f"-{pc.getOptionsPrefix()}pc_mg_levels"
-            raise InputError(f"option {name} {levels}: must be from 1 to {available} for this grid")
+            raise InputError(f"option {name} {levels}: must be from 2 to {available} for this grid")
         self.transfers = hierarchy.transfers[: levels - 1]
+        self._last = LastLevel(pc)
+        if hierarchy.walled and self._last.be_algebraic():
+            self.transfers, levels = [_unchanged(fine)], 2
         self._galerkin = options.getString("pc_mg_galerkin", "none") != "none"
         self._fluxes: list[PETSc.Mat] = []
         self._pattern_version = 0
@@ -266,6 +295,11 @@ class Multigrid:
         pc.setMGLevels(levels)
         for n, transfer in enumerate(self.transfers):
             pc.setMGInterpolation(levels - 1 - n, transfer.linear)
+            rows, columns = transfer.linear.getSize()
+            if rows == columns:  # PETSc cannot tell which grid is the coarser one
+                scale = transfer.linear.createVecRight()
+                scale.set(1.0)
+                pc.setMGRScale(levels - 1 - n, scale)
 
     def refresh(
         self,
@@ -290,6 +324,8 @@ class Multigrid:
         pattern_version : int
             Of L's pattern.
         """
+        if not self._read:
+            self._last.read(fluxes, self.transfers[-1].linear.getSize()[1])
         if pattern_version != self._pattern_version:
             self._fluxes, self._pattern_version = [], pattern_version
         if self._galerkin:
@@ -327,7 +363,7 @@ class Multigrid:
 
     def can_resist(self) -> bool:
         """Return whether the finest level does with an operator that is no matrix. Collective."""
-        if self._galerkin or not self.transfers:
+        if self._galerkin:
             return False
         solver = self._pc.getMGSmoother(len(self.transfers))
         if not self._read:
@@ -347,6 +383,14 @@ class Multigrid:
             if pc.getPythonContext() is None:
                 pc.setPythonContext(Walls())
             pc.getPythonContext().parts, pc.getPythonContext().resisted = parts, resisted
+
+
+def _unchanged(fine: PETSc.Mat) -> Transfer:
+    """Return the transfer between a level and itself. Collective."""
+    first, last = fine.getOwnershipRange()
+    n = np.arange(last - first + 1, dtype=IntType)
+    one = PETSc.Mat().createAIJ(fine.getSizes(), csr=(n, first + n[:-1], np.ones(last - first)), comm=fine.comm)
+    return Transfer(one, one, regular=False)
 
 
 def _carried(fine: PETSc.Mat, transfer: PETSc.Mat, result: PETSc.Mat | None) -> PETSc.Mat:

@@ -78,7 +78,8 @@ def set_csr(mat: PETSc.Mat, indptr: np.ndarray, indices: np.ndarray, values: np.
     """
     if new_pattern and mat.getType() == PETSc.Mat.Type.SEQAIJ:
         # four times as fast as PETSc's function for it, which looks for each entry's place
-        mat.setPreallocationNNZ(np.diff(indptr).astype(IntType))
+        # of two numbers alone petsc4py would take the second one for that of other ranks
+        mat.setPreallocationNNZ((np.diff(indptr).astype(IntType), None))
         mat.setOption(PETSc.Mat.Option.SORTED_FULL, True)
         mat.setValuesCSR(indptr, indices, values)
         mat.assemble()

@@ -94,6 +94,8 @@ def skipped(scene: Scene) -> list[str]:
         out.append("gravity: not given")
     if scene.solids and all(s.damping.mass == 0 and s.damping.stiffness == 0 for s in scene.solids.values()):
         out.append("damping: its coefficients are 0")
+    if not scene.output.accounts and scene.time.energy_limit >= 0:
+        out.append("time.energy_limit: output.accounts is false")
     if scene.output.every is None:
         out.append("fields.xdmf: there is no output.every")
     return out

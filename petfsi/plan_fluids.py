@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from petfsi.scene.fluids import MacFluid, SphFluid
 from petfsi.scene.schema import Scene
+from petfsi.scene.side_notes import side_notes
 
 #: Vectors of the length of all unknowns: those of 30 flexible GMRES iterations, and a few more.
 KRYLOV_VECTORS = 65
@@ -64,6 +65,7 @@ def _mac(scene: Scene) -> FluidPlan:
     assert isinstance(fluid, MacFluid)
     n = math.prod(fluid.cells)
     rows = [("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, fluid.cells))}")]
+    rows += [("note", note) for note in side_notes(scene)]
     arrays = 8 * (4 * dim + 4) + dim + 5 + (16 if fluid.smoke is not None else 0)
     matrix = ENTRY_BYTES * (2 * dim + 1) * (1 + PRECONDITIONER)
     per_output = 8 * (dim + 2 + (fluid.smoke is not None))

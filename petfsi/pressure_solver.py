@@ -10,6 +10,7 @@ from petfsi.errors import InputError
 from petfsi.fields.base import PressureFluid, SolidField
 from petfsi.modes import DEGREE, LIGHT, LINEAR, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
+from petfsi.preconditioners import SINGULAR, read_options
 from petfsi.resisted import Resisted
 from petfsi.schur import FAINT, SchurStandIn
 from petfsi.smoothers import DOMINANT
@@ -51,7 +52,8 @@ class PressureSolver:
         self.eliminates = bool(system.index_sets) and options.getString("pc_fieldsplit_type", "") == "schur"
         if self.eliminates and options.getString("pc_fieldsplit_schur_precondition", "a11") == "user":
             own = PETSc.Options(f"{outer.getOptionsPrefix()}fieldsplit_{fluid.name}_")
-            self.stand_in = SchurStandIn(system, own.getReal("schur_faint", FAINT))
+            faint = own.getReal("schur_faint", FAINT) * _weakest(fluid)
+            self.stand_in = SchurStandIn(system, faint)
             outer.getPC().setFieldSplitSchurPreType(PETSc.PC.SchurPreType.USER, self.stand_in.operator)
 
     def connect(self, ksp: PETSc.KSP, hierarchy: Hierarchy | None) -> None:
@@ -72,6 +74,8 @@ class PressureSolver:
                 raise InputError(f"option -{pc.getOptionsPrefix()}pc_type mg: needs a grid; hypre and gamg do not")
             fine = self.stand_in.operator if self.stand_in is not None else self.fluid.block
             self._multigrid = Multigrid(pc, hierarchy, fine)
+        elif pc.getType() == PETSc.PC.Type.HYPRE:
+            read_options(pc, SINGULAR)
         self._pass_on()
         if self.stand_in is not None and self._symmetric():
             self._add_modes(ksp)
@@ -173,7 +177,27 @@ class PressureSolver:
         """Hold on to no solver any longer."""
         self._ksp = self._multigrid = self._resisted = None
 
+    def round_off(self) -> float:
+        """Return what the residual of the pressure's rows cannot fall below at the solution there. Collective.
+
+        Where that is still nothing, at what the preconditioner makes of the right-hand side.
+        """
+        pressure = self.system.values()[self.system.fields.index(self.fluid)]
+        if self._ksp is not None and not self.system.comm.allreduce(bool(pressure.any()), MPI.LOR):
+            guess, known = self.fluid.block.createVecs()
+            known.array = self.system.rhs.array_r[self.system.piece(self.fluid.name)]
+            self._ksp.setUp()
+            self._ksp.getPC().apply(known, guess)
+            pressure = guess.array_r * self.fluid.col_scale
+        return self.fluid.round_off(pressure)
+
     def aim(self, residual: float) -> None:
         """Let the inner solver stop where the whole has the wanted residual, unless options say where."""
         if self.eliminates and self._aims and self._ksp is not None:
             self._ksp.setTolerances(atol=SHARE * residual)
+
+
+def _weakest(fluid: PressureFluid) -> float:
+    """Return the coupling of cells along their longest side as a part of that along their shortest one."""
+    grid = getattr(fluid, "grid", None)
+    return 1.0 if grid is None else float((grid.dx.min() / grid.dx.max()) ** 2)

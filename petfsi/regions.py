@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -243,6 +245,17 @@ class ClosedRegions:
             for row, values in zip(whole, self.unfelt, strict=True):
                 row[system.piece(fluid.name)] = values
             _attach(system.operator, list(whole))
+
+    @contextmanager
+    def coupled(self) -> Iterator[None]:
+        """Have solid and pressure solved at once inside, not the pressure by itself. Collective."""
+        decoupled, self.decoupled, self._attached_for = self.decoupled, False, None
+        self.attach()
+        try:
+            yield
+        finally:
+            self.decoupled, self._attached_for = decoupled, None
+            self.attach()
 
     def _find_unfelt(self) -> np.ndarray:
         """Return the pressures, even in each region, that no solid feels: an orthogonal set, shape (n, n_regions).

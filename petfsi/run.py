@@ -7,6 +7,7 @@ import signal
 import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -312,8 +313,8 @@ def resume_run(
             raise InputError(
                 f"{directory}: no checkpoint can be read; start again with 'petfsi run {files.scene} --out ...'"
             )
-        unread = simulation.prepare()  # of the scene's start: it would move the fluid's faces to the restored solid
-        simulation.forget()
+        # of the scene's start: it would move the fluid's faces to the restored solid
+        unread = simulation.prepare(resumes=True)
         with checkpoints.read_checkpoint(found, comm) as stored:
             simulation.restore(stored.step, stored.time, stored.dt, stored.group)
         _greet(console, simulation, unread)
@@ -334,7 +335,8 @@ def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
-    for note in simulation.fluid.notes if simulation.fluid else []:
+    told = [part.notes for part in (simulation.fluid, simulation.watch) if part is not None]
+    for note in [*chain.from_iterable(told), *simulation.notes]:
         console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")

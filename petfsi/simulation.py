@@ -9,19 +9,21 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build, petsc
+from petfsi import build, petsc, start
 from petfsi.accounts import Accounts
 from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
-from petfsi.errors import InputError, NoSolutionError, SolveError
+from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
 from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
+from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 from petfsi.solve import Outcome, Solver
 from petfsi.substeps import StableStep
 from petfsi.system import System
+from petfsi.touch import watch
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
 
@@ -30,6 +32,9 @@ SCALARS = ("pressure", "smoke", "angle", "front", "level")
 
 #: The solution of a field without unknowns.
 NOTHING = np.zeros(0)
+
+#: A start that changes the kinetic energy by more than this part of it is told of.
+START_NOTED = 1e-3
 
 #: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
 #: is left.
@@ -50,11 +55,15 @@ class Simulation:
         Into how many the last step was divided: because an explicit scheme needs shorter ones, or a solve failed.
     report : callable
         Is told in a line what a user should know of a step.
+    notes : list of str
+        What a user should know of how it begins, from ``prepare`` on.
     outcome : Outcome
         What the solves of the last step reported.
     volume_error : float
         Largest relative change of a closed region's fluid volume in a (sub-)step, |sum of net outflows| h / V.
         A split solve spreads a compatible correction over the region: then this is its size.
+    guard : EnergyGuard
+        Stops a run whose energy grows out of nothing.
     accounts : Accounts
         Momentum, energy and volumes, from ``prepare`` on.
     phases : dict
@@ -80,10 +89,13 @@ class Simulation:
         self._retries = 0 if self.stable.limited else scene.time.retries
         self.substeps = 1
         self.report: Callable[[str], None] = lambda text: None
+        self.notes: list[str] = []
         self.regions: ClosedRegions | None = None
         if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
+        self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
+        self.guard = EnergyGuard(comm, scene)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
@@ -120,10 +132,10 @@ class Simulation:
         """
         t = self.time
         dt = self.dt = self._length(t)
-        n = self.stable.count(t, dt)
         self.substeps, self.outcome, self.volume_error = 0, Outcome(0, 0.0), 0.0
-        for number in range(n):
-            self._take(t + number * dt / n, dt / n, self._retries)
+        for begin, length in self.stable.parts(t, dt):
+            self._take(begin, length, self._retries)
+        self.guard.judge(self.accounts.values, self._advice())
         self.step += 1
         self.time = self._stepping.after(self.step, t, dt)
 
@@ -138,7 +150,7 @@ class Simulation:
         try:
             self._attempt(t, dt)
         except SolveError as error:
-            if retries == 0 or isinstance(error, NoSolutionError):
+            if retries == 0 or isinstance(error, FinalError):
                 raise
             why = str(error).split(": ")[0]
             self.report(f"t = {t:.6g} s: the step of {dt:g} s is taken again as two halves: {why}")
@@ -181,14 +193,23 @@ class Simulation:
         for field in self.fields:
             field.forget()
 
-    def prepare(self) -> list[str]:
+    def prepare(self, resumes: bool = False) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
 
+        Then let the velocities of fluid and solids fit each other, unless a run ``resumes`` with those of a checkpoint.
         Collective. Returns the options of others that nothing reads.
+
+        Raises
+        ------
+        SolveError
+            On all ranks, if that start cannot be found.
         """
         self.rehearse()
+        unread = self.solver.check_options()
         self.accounts.start()
-        return self.solver.check_options()
+        if not resumes:
+            self._fit_velocities()
+        return unread
 
     def rehearse(self) -> None:
         """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
@@ -200,6 +221,21 @@ class Simulation:
         self._assemble(self.time, self.dt)
         with np.errstate(all="ignore"):  # what overflows is found by those who judge the solve
             self._check_equations()
+
+    def _fit_velocities(self) -> None:
+        """Let fluid and solids begin with velocities that fit each other; note what that did. Collective."""
+        if self.regions is None or not isinstance(self.fluid, PressureFluid) or not isinstance(self.solver, Solver):
+            return
+        before = self.accounts.values.get("kinetic", np.nan)
+        if not start.fit_velocities(self.system, self.solver, self.regions, self.fluid, self.solid, self.dt):
+            return
+        self.accounts.start()
+        after = self.accounts.values.get("kinetic", np.nan)
+        if abs(after - before) > START_NOTED * max(before, after):
+            self.notes.append(
+                f"the velocities given at t = 0 did not fit each other, and were brought to the nearest that do: "
+                f"kinetic energy {after:.4g} J, not {before:.4g} J"
+            )
 
     def _check_equations(self) -> None:
         """Refuse a scene whose first step has no solution: before anything is written. Collective."""
@@ -276,6 +312,8 @@ class Simulation:
             if self.stable.limited:
                 self.stable.moved(fastest * dt)
             self.solid.judge(values["solid"], dt)
+            if self.watch:
+                self.watch.judge(self.solid.surface_arrival(values["solid"], dt), t, dt)
             self.solid.accept(values["solid"], t, dt)
         for coupling in self.couplings:
             coupling.accept(values, t, dt)
@@ -315,10 +353,20 @@ class Simulation:
         if not fastest * dt < extent:
             raise SolveError(
                 f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
-                f"in one step of {dt:g} s. A splitting scheme fails like this where the fluid that moves with the "
-                f"solid outweighs it, at small steps most of all: try monolithic.opts. Else more damping, a smaller dt."
+                f"in one step of {dt:g} s. {self._advice()}"
             )
         return fastest
+
+    def _advice(self) -> str:
+        """Return what may help a run that blows up."""
+        if self.solver.decoupled:
+            return (
+                "A splitting scheme fails like this where the fluid that moves with the solid outweighs it, at small "
+                "steps most of all: try monolithic.opts. Else more damping, a smaller dt."
+            )
+        if self.stable.limited or self.solver.iterates:
+            return "Try a smaller dt, or more damping."
+        return "Try a smaller dt, -fsi_snes_type newtonls, or more damping."
 
     def probe_columns(self) -> list[str]:
         """Return the names of the probes' columns in history.csv."""
@@ -372,6 +420,8 @@ class Simulation:
             states["regions"] = self.regions.state()
         if self.accounts.columns:
             states["accounts"] = self.accounts.state()
+        if self.accounts.columns:
+            states["guard"] = self.guard.state()
         if self.stable.limited:
             states["stable"] = self.stable.state(self.comm)
         return states
@@ -385,14 +435,19 @@ class Simulation:
         group : callable
             Returns the reader of a group of ``state`` by its name.
         """
+        self.forget()  # of the scene's start
         self.step, self.time, self.dt = step, time, dt
         for field in self.fields:
             field.restore(group(field.name))
+        if self.solid and self.watch:
+            self.watch.resume(self.solid)
         for coupling in self.couplings:
             coupling.restored()
         if self.regions:
             self.regions.restore(group("regions"))
         if self.accounts.columns:
             self.accounts.restore(group("accounts"))
+        if self.accounts.columns:
+            self.guard.restore(group("guard"))
         if self.stable.limited:
             self.stable.restore(group("stable"))

@@ -362,7 +362,7 @@ class Solver:
         """
         system, ksp = self.system, self._ksp
         assert ksp is not None
-        size, floor = b.norm(), system.rhs_round_off()
+        size, floor = b.norm(), self._floor()
         if not np.isfinite(size + floor):
             raise SolveError(blown_up([field.name for field in system.fields]))
         rtol, warm = ksp.getTolerances()[0], ksp.getInitialGuessNonzero() and not self.fixed_iterations
@@ -377,7 +377,8 @@ class Solver:
         lost = 0.0
         norms = system.update_residual(x, b)
         if norms[""] > max(rtol * size, floor) and not self.fixed_iterations:
-            if warm and ksp.getConvergedReason() > 0:
+            floor = self._floor()  # the first guess may have been nothing
+            if warm and ksp.getConvergedReason() > 0 and norms[""] > max(rtol * size, floor):
                 # what iterations update drifts from the true residual by round-off: they go on from there
                 iterations += self._run(b, x)
                 self._inner_iterations = iterations
@@ -390,6 +391,11 @@ class Solver:
         """Begin from zero if the guess is too coarse to get from it to what is wanted, and no better. Collective."""
         if wanted < self.system.round_off_at(x) and not self.system.update_residual(x, b)[""] <= size:
             x.set(0.0)
+
+    def _floor(self) -> float:
+        """Return what the residual cannot fall below at pressures as they are in the system's solution. Collective."""
+        floor = self.system.rhs_round_off()
+        return floor if self._pressure is None else max(floor, self._pressure.round_off())
 
     def _run(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
         """Run the solver; return its iterations, of the inner one if that takes more. Collective."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from mpi4py import MPI
 
@@ -17,6 +17,8 @@ EVERY = 100
 STRETCH = 0.05
 #: Sub-steps are this part of the stable step at most: it may shrink until it is found anew.
 MARGIN = 0.9
+#: Parts of a step are too long if it is by more than rounding.
+SLACK = 1e-9
 #: A step that must be divided more often has blown up.
 MOST = 100_000
 
@@ -28,7 +30,7 @@ class StableStep:
     when the body may have changed too much since: the ends of an edge can have moved apart by twice the way of the
     fastest node, and once that may be ``STRETCH`` of the shortest edge the edges are looked at. Once is enough where it
     never changes. A run that goes on knows the one last found: else it might divide its steps otherwise. That of other
-    fields costs little and is found before each step. The smallest counts.
+    fields costs little and is found before each step, or part of one. The smallest counts.
 
     Parameters
     ----------
@@ -92,6 +94,20 @@ class StableStep:
             )
         return 1
 
+    def parts(self, t: float, dt: float) -> Iterator[tuple[float, float]]:
+        """Divide a step of length dt that begins at t: yield begin and length of each part, to be taken then.
+
+        They are equal as long as they stay below the stable step; once that has been found to be shorter, so are those
+        that are left. Collective; raises what ``count`` does.
+        """
+        n, number = self.count(t, dt), 0
+        while number < n:
+            yield t + number * dt / n, dt / n
+            number += 1
+            if number < n and dt / n > (1 + SLACK) * MARGIN * self.present()[0]:
+                t, dt = t + number * dt / n, dt * (n - number) / n
+                n, number = self.count(t, dt), 0
+
     def _find(self) -> None:
         solid = self._solid
         assert solid is not None
@@ -104,7 +120,7 @@ class StableStep:
             self._steps, self._way, self._stretch = 0, 0.0, 0.0
 
     def moved(self, way: float) -> None:
-        """Count a step in which no node moved farther than ``way``, m."""
+        """Count a step, or a part of one, in which no node moved farther than ``way``, m."""
         if self._solid is not None and not self._solid.is_linear:
             self._steps, self._way = self._steps + 1, self._way + way
 

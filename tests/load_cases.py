@@ -64,4 +64,4 @@ def ring(path, lame=1.5, **more):
     young, poisson = (3 * lame + 2) / (lame + 1), lame / (2 * (lame + 1))
     supports = [{"where": {"tag": "floor"}, "fix": ["y"]}, {"where": {"tag": "3"}, "fix": ["x"]}]
     solid = {"shape": {"mesh": str(path)}, "density": 1.0, "young": young, "poisson": poisson, "supports": supports}
-    return {"dim": 2, "time": {"end": 1.0, "dt": 0.1}, "solids": {"ring": solid | more}}
+    return {"dim": 2, "time": {"end": 1.0, "dt": 0.1, "integrator": "newmark"}, "solids": {"ring": solid | more}}

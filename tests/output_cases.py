@@ -128,6 +128,6 @@ def run_on(ranks: int, code: str, directory: Path) -> subprocess.CompletedProces
         [*launcher(ranks), sys.executable, "-c", text],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
         env=environment(),
     )

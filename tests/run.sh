@@ -10,9 +10,10 @@ bash jobs/setup.sh
 .venv/bin/ruff format --check petfsi tests
 .venv/bin/mypy petfsi
 
-.venv/bin/python -m pytest -q --durations=10 "$@"
 # ranks that share cores spin while they wait; yielding lets the others work
 export OMPI_MCA_mpi_yield_when_idle=1
+# a process per core; who has nothing left takes tests from the others
+.venv/bin/python -m pytest -q -n auto --dist worksteal --durations=10 "$@"
 for ranks in 2 3 4; do
     echo "== $ranks ranks"
     # all ranks say the same: rank 0's last line is enough, unless a test fails on one of them and the others wait

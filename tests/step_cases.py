@@ -24,7 +24,7 @@ def block(cells=(1, 1), size=(1.0, 1.0), time=None, gravity=None, output=None, *
     return Scene.model_validate(
         {
             "dim": 2,
-            "time": {"end": 1.0, "dt": 0.1} | (time or {}),
+            "time": {"end": 1.0, "dt": 0.1, "integrator": "newmark"} | (time or {}),
             "gravity": gravity,
             "output": output or {},
             "solids": {"block": body | solid},

@@ -119,7 +119,7 @@ def body(*centre, radius=0.1, **more):
 
 def scene(solids, obstacles=None):
     fluid = {"density": 1.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [8, 8]}
-    time = {"end": 1.0, "dt": 0.1}
+    time = {"end": 1.0, "dt": 0.1, "integrator": "newmark"}
     return scene_from_dict({"dim": 2, "time": time, "fluid": fluid, "solids": solids, "obstacles": obstacles or {}})
 
 

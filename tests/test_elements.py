@@ -114,16 +114,17 @@ def test_forces_alone_are_those_beside_the_matrix(dim, kind):
     np.testing.assert_allclose(alone.ravel(), expected, atol=1e-13 * np.abs(b).max())
 
 
-def test_powers_are_those_of_the_matrices(dim, kind):
+def test_damping_and_residuals_are_those_of_the_matrices(dim, kind):
     mesh = bent(dim, kind, n=2)
     elements, pattern = elements_of(mesh, "neohookean", volumetric=kind[1]), pattern_of(mesh)
     elements.bodies.mass_damping[:], elements.bodies.stiffness_damping[:] = 0.4, 0.1
-    d, V, s, w, g = (wave(len(mesh.points), dim, seed=seed, size=0.02) for seed in range(5))
+    d, V, s, w = (wave(len(mesh.points), dim, seed=seed, size=0.02) for seed in range(4))
     A, b = respond(elements, pattern, d, V, s, a=2.0, k=0.3)
     C = A - respond(elements_of(mesh, "neohookean", volumetric=kind[1]), pattern, d, a=2.0, k=0.3)[0]
-    lost, done = elements.powers(State(d, V, s), 2.0, 0.3, w, g, mesh.counted)
-    assert lost == pytest.approx(w.ravel() @ C @ w.ravel(), rel=1e-11)
-    assert done == pytest.approx(g.ravel() @ (A @ w.ravel() - b.ravel()), rel=1e-11)
+    assert elements.damping(d, w, mesh.counted) == pytest.approx(w.ravel() @ C @ w.ravel(), rel=1e-11)
+    left = np.empty_like(d)
+    elements.forces(State(d, V - (2.0 + 0.4) * w, s + (0.3 + 0.1) * w), left)
+    np.testing.assert_allclose(left.ravel(), b.ravel() - A @ w.ravel(), atol=1e-11 * np.abs(b).max())
 
 
 def test_at_rest_only_rigid_motions_cost_nothing(dim, kind):

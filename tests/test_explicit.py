@@ -11,6 +11,7 @@ from petfsi.errors import InputError, SolveError
 from petfsi.fields.solid.elements import State
 from petfsi.integrators import stable_step
 
+JOBS = Path(__file__).parents[1] / "jobs"
 BODY = {"cells": (4, 3), "size": (2.0, 1.0)}
 SWING = {"velocity": ["0.05*x", "0.2*x"]}
 
@@ -99,6 +100,24 @@ def test_sub_steps_are_steps():
     short = stepped(explicit({"dt": h / 2}, material="linear", initial=SWING), 16)
     assert divided.time == short.time and np.array_equal(motion(divided), motion(short))
     assert divided.accounts.values == short.accounts.values
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_long_step_is_divided_anew_on_its_way():
+    """The block is stretched and bent on the way, and its waves become faster: its tip swings by more than a metre."""
+
+    def swung(dt, n):
+        sets = f"time.dt={dt}", "solids.block.shape.box.cells=[8, 2]"
+        with prepared(loaded(JOBS / "neohookean.toml", *sets)) as sim:
+            take, lengths = sim._take, []
+            sim._take = lambda begin, length, retries: (lengths.append(length), take(begin, length, retries))
+            for _ in range(n):
+                sim.advance()
+        return motion(sim), np.array(lengths)
+
+    (long, parts), (short, _) = swung(0.8, 1), swung(0.01, 80)
+    assert len(np.unique(parts)) > 5 and np.all(np.diff(parts) <= 0) and parts.sum() == pytest.approx(0.8, rel=1e-12)
+    assert np.abs(long - short).max() < 0.01 * np.abs(short).max()
 
 
 def energies(scene, n, every, bypass=False):

@@ -129,7 +129,7 @@ def test_ffmpeg_may_fail_early_and_says_why(tmp_path, monkeypatch):
     (tmp_path / "a.mp4").write_text("an older film")
     # a process of its own: PETSc, as pytest's has it, ends one that writes to a reader that has left
     words = [sys.executable, "-m", "petfsi.cli", "plot", str(tmp_path), "--film", str(tmp_path / "a.mp4")]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60, env=environment())
+    done = subprocess.run(words, capture_output=True, text=True, timeout=180, env=environment())
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "petfsi: ffmpeg wrote no film (exit code 1): no room for a film\n"
     assert sorted(path.name for path in tmp_path.glob("a.*")) == ["a.mp4"]

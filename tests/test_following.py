@@ -38,7 +38,7 @@ def room(size, cells):
 
 def scene(cells, **more):
     fluid = {"density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": cells}
-    return {"dim": 2, "time": {"end": 1.0, "dt": 0.01}, "fluid": fluid} | more
+    return {"dim": 2, "time": {"end": 1.0, "dt": 0.01, "integrator": "newmark"}, "fluid": fluid} | more
 
 
 def run(data, steps, each=lambda sim: None):

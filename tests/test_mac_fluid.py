@@ -174,8 +174,8 @@ def test_what_a_jet_brings_in_leaves_through_the_rest(side, axis, sign):
         step(fluid, 0.05 * number, 0.05)
         v, kind = fluid.velocity[axis][grid.owned(axis)], fluid.face_kind[axis][grid.owned(axis)]
         inflow = total(fluid, v[kind == kinds.WALL].sum())
-        # the ball meets the side where |y - 1/2| < 0.1428: six faces
-        assert inflow == pytest.approx(sign * 6 * 2.0 * part, abs=1e-12)
+        # the ball meets the side where |y - 1/2| < sqrt(0.52^2 - 0.5^2), 5.71 of 20 faces
+        assert inflow == pytest.approx(sign * 40 * np.sqrt(0.52**2 - 0.25) * 2.0 * part, abs=1e-12)
         assert total(fluid, v[kind == kinds.OPEN].sum()) == pytest.approx(-inflow, abs=1e-11)
 
 

@@ -193,7 +193,7 @@ def test_a_file_is_its_surface(tmp_path, outside):
 
 def scene(obstacles, directory=".", **sides):
     fluid = {"density": 1.0, "origin": [0.0, -1.0], "size": [2.0, 2.0], "cells": [20, 40], "sides": sides}
-    data = {"dim": 2, "time": {"end": 1.0, "dt": 0.1}, "fluid": fluid, "obstacles": obstacles}
+    data = {"dim": 2, "time": {"end": 1.0, "dt": 0.1, "integrator": "newmark"}, "fluid": fluid, "obstacles": obstacles}
     return scene_from_dict(data, directory)
 
 
@@ -262,7 +262,7 @@ BALL_VOLUME = 4 / 3 * math.pi
 )
 def test_the_grid_finds_the_room_that_obstacles_leave(obstacles, room, sides):
     fluid = {"density": 1.0, "origin": [0.0] * 3, "size": [1.0] * 3, "cells": [10, 12, 14], "sides": sides}
-    data = {"dim": 3, "time": {"end": 1.0, "dt": 0.1}, "fluid": fluid, "obstacles": obstacles}
+    data = {"dim": 3, "time": {"end": 1.0, "dt": 0.1, "integrator": "newmark"}, "fluid": fluid, "obstacles": obstacles}
     every = obstacle_surfaces(scene_from_dict(data))
     cells = np.array([10, 12, 14])
     periodic = np.array(["left" in sides, False, False])

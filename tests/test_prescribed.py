@@ -34,10 +34,13 @@ def test_a_prescribed_displacement_is_met_at_the_end_of_every_step(integrator, d
         np.testing.assert_allclose(d[right, :2], wanted(t), atol=1e-15)
         np.testing.assert_allclose(d[left, 0], 0.0, atol=1e-15)
 
-    check(0.0)
     u = gathered(solid, "velocity")[right, :2]
     y = points[right, 1]
-    np.testing.assert_allclose(u, np.column_stack((0.2 * np.cos(y), 0.03 + 0 * y)), atol=1e-7)
+    if integrator == "static":  # the first step goes there
+        assert not np.any(gathered(solid, "displacement")) and not np.any(u)
+    else:
+        check(0.0)
+        np.testing.assert_allclose(u, np.column_stack((0.2 * np.cos(y), 0.03 + 0 * y)), atol=1e-7)
     t = 0.0
     for h in (0.1, 0.1, 0.07, 0.13):
         step(solid, t, h)

@@ -68,7 +68,13 @@ def make_scene(cells, size, solids=None, **extra):
     dim = len(cells)
     fluid = {"density": 1000.0, "origin": [0.0] * dim, "size": size, "cells": cells, "sides": extra.pop("sides", {})}
     return Scene.model_validate(
-        {"dim": dim, "time": {"end": 1.0, "dt": 0.1}, "fluid": fluid, "solids": solids or {}, **extra}
+        {
+            "dim": dim,
+            "time": {"end": 1.0, "dt": 0.1, "integrator": "newmark"},
+            "fluid": fluid,
+            "solids": solids or {},
+            **extra,
+        }
     )
 
 

@@ -167,9 +167,9 @@ BROKEN = [
     (["fluid.cells=[32, 6.5]"], "fluid.cells.1 = 6.5", "must be a whole number"),
     (["fluid.cells=64"], "fluid.cells = 64", "must be a list"),
     (["fluid.origin=['a', 0.0]"], 'fluid.origin.0 = "a"', "must be a number"),
-    (["fluid.sides.top=opn"], 'fluid.sides.top = "opn"', "must be 'slip', 'open' or 'periodic' (or { inflow"),
-    (["fluid.sides.top={}"], "fluid.sides.top.inflow", "is missing"),
-    (["fluid.sides.right.inflow.rest=shut"], 'inflow.rest = "shut"', "must be 'slip' or 'open'"),
+    (["fluid.sides.top=opn"], 'fluid.sides.top = "opn"', "must be 'slip', 'open', 'hydrostatic' or 'periodic' (or"),
+    (["fluid.sides.top={}"], "fluid.sides.top", "or a table of one of inflow, pressure and hydrostatic"),
+    (["fluid.sides.right.inflow.rest=shut"], 'inflow.rest = "shut"', "must be 'slip', 'open' or 'hydrostatic'"),
     (["fluid.sides.right.inflow.ramp=-1"], "fluid.sides.right.inflow.ramp = -1", "must be 0 or more (s"),
     (["solids.layer.poisson=0.5"], "solids.layer.poisson = 0.5", "must be less than 0.5"),
     (["solids.layer.young=0"], "solids.layer.young = 0", "must be greater than 0 (Pa)"),
@@ -206,6 +206,7 @@ BROKEN = [
     (["probes.top.quantity=stress"], 'probes.top.quantity = "stress"', "'velocity', 'angle', 'pressure', "),
     (["time.above_limit=ignore"], 'time.above_limit = "ignore"', "must be 'refuse' or 'subcycle'"),
     (["time.retries=-1"], "time.retries = -1", "must be 0 or more"),
+    (["time.energy_limit=-2"], "time.energy_limit = -2", "must be 0 or more, or -1"),
     (["time.retries=21"], "time.retries = 21", "must be 20 or less"),
     (["time.integrator=static", "solids.layer.initial={}"], 'time.integrator = "static"', "take out the [fluid]"),
     (["checkpoint.keep=0"], "checkpoint.keep = 0", "must be 1 or more"),
@@ -223,7 +224,7 @@ BROKEN = [
     (["solids.layer.shape.box.cell=[1]"], "solids.layer.shape.box.cell", "did you mean 'cells'?"),
     (["fluid.gravity=[0.0]"], "fluid.gravity", "it stands at the top of the scene"),
     (["fluid.dt=0.1"], "fluid.dt = 0.1", "did you mean 'time.dt'?"),
-    (["fluid.sides.right.inflow.young=1.0"], "young = 1.0", "did you mean 'solids.<name>.young'?"),
+    (["fluid.sides.right.inflow.poisson=0.3"], "poisson = 0.3", "did you mean 'solids.<name>.poisson'?"),
     (["output.qqq=1"], "output.qqq = 1", "known here are every"),
     # lengths and sizes
     (["gravity=[0.0]"], "gravity = [0.0]", "must have 2 items, as dim = 2"),
@@ -597,7 +598,7 @@ def test_a_dumped_scene_is_the_scene(tmp_path, text):
 
 def test_a_dumped_scene_names_every_setting():
     data = tomllib.loads(dump_scene(scene_from_dict(layer())))
-    assert data["time"]["integrator"] == "newmark" and data["checkpoint"]["keep"] == 3
+    assert data["time"]["integrator"] == "bdf2" and data["checkpoint"]["keep"] == 3
     assert data["fluid"]["sides"]["left"] == "slip" and "back" not in data["fluid"]["sides"]
     assert data["solids"]["layer"]["damping"] == {"mass": 0.0, "stiffness": 0.0}
     assert data["solids"]["layer"]["density"] == 1200.0
@@ -727,7 +728,9 @@ def test_a_resumed_run_may_change_when_it_ends_and_what_it_writes(tmp_path):
     scene = load_scene(path, ["time.end=3.0", "output.every=0.1", "checkpoint.keep=1"], only=RESUMABLE)
     assert (scene.time.end, scene.output.every, scene.checkpoint.keep) == (3.0, 0.1, 1)
     for setting in ("time.dt=0.1", "time={}", "outputs.every=1", "solids.layer.young=1"):
-        with pytest.raises(InputError, match="here only time.end, output, checkpoint may be changed"):
+        with pytest.raises(
+            InputError, match="here only time.end, time.energy_limit, output, checkpoint may be changed"
+        ):
             load_scene(path, [setting], only=RESUMABLE)
 
 

@@ -66,7 +66,9 @@ def test_a_body_in_space_keeps_its_momentum_too():
     fluid = {"kind": "sph", "density": 1000.0, "origin": [0.0] * 3, "size": [1.0] * 3, "spacing": 0.1}
     fluid |= {"sound_speed": 10.0, "viscosity": 3000.0, "fill": [{"box": {"origin": [0.0] * 3, "size": [1.0] * 3}}]}
     fluid["sides"] = dict.fromkeys(("left", "right", "bottom", "top", "back", "front"), "periodic")
-    scene = scene_from_dict({"dim": 3, "time": {"end": 0.1, "dt": 0.01}, "fluid": fluid, "solids": {"body": body}})
+    scene = scene_from_dict(
+        {"dim": 3, "time": {"end": 0.1, "dt": 0.01, "integrator": "newmark"}, "fluid": fluid, "solids": {"body": body}}
+    )
     with only_options(DIRECT):
         sim = prepared(scene)
         assert sim.fluid.has_block

@@ -200,7 +200,7 @@ def test_a_block_in_3d_keeps_momentum_too():
     fluid = {"kind": "sph", "density": 1000.0, "origin": [0.0] * 3, "size": [1.0] * 3, "spacing": 0.1}
     fluid |= {"sides": dict.fromkeys((*PERIODIC, "back", "front"), "periodic"), "sound_speed": 10.0}
     fluid["fill"] = [{"box": {"origin": [0.0, 0.0, z], "size": [1.0, 1.0, 0.2]}} for z in (0.0, 0.8)]
-    time, coupling = {"end": 0.1, "dt": "auto"}, {"transfer": "repulsion"}
+    time, coupling = {"end": 0.1, "dt": "auto", "integrator": "newmark"}, {"transfer": "repulsion"}
     table = {"dim": 3, "time": time, "fluid": fluid, "solids": {"body": body}, "coupling": coupling}
     with only_options(DIRECT):
         sim, momenta, met = prepared(scene_from_dict(table)), [], []
@@ -223,7 +223,7 @@ def layer(ratio, gap, end):
     fluid |= {"sound_speed": 40.0, "artificial_viscosity": 0.3}
     fluid["sides"] = PERIODIC | {"top": "open", "bottom": "slip"}
     fluid |= {"fill": [{"box": {"origin": [0.0, 0.5 + (gap - 0.5) * 0.1], "size": [0.5, 1.0]}}]}
-    time = {"end": end, "dt": "auto"}
+    time = {"end": end, "dt": "auto", "integrator": "newmark"}
     return scene_from_dict({
         "dim": 2, "time": time, "fluid": fluid, "gravity": [0.0, -9.81],
         "solids": {"layer": solid}, "probes": probes, "coupling": {"transfer": "repulsion"},

@@ -147,7 +147,12 @@ def sheet_on_corner(dim, foot):
         held += [{"where": side, "fix": ["z"]} for side in ("back", "front")]
     solid = {"shape": {"box": sheet}, "density": 1100.0, "young": 1e7, "poisson": 0.3, "supports": held}
     corner = {"shape": {"box": {"origin": [-0.1] * dim, "size": [0.6, 0.6, 0.7][:dim]}}}
-    data = {"dim": dim, "gravity": [0.0, -9.81, 0.0][:dim], "time": {"end": 0.05, "dt": 0.01}, "fluid": fluid}
+    data = {
+        "dim": dim,
+        "gravity": [0.0, -9.81, 0.0][:dim],
+        "time": {"end": 0.05, "dt": 0.01, "integrator": "newmark"},
+        "fluid": fluid,
+    }
     return data | {"solids": {"sheet": solid}, "obstacles": {"corner": corner}}
 
 
@@ -172,7 +177,12 @@ def test_water_between_a_beam_drawn_into_the_walls_stays_where_it_is():
     held = [{"where": end, "fix": ["x", "y", "angle"]} for end in ("start", "end")]
     solid = {"shape": {"beam": beam}, "density": 1100.0, "young": 1e9, "poisson": 0.3, "supports": held}
     fluid = {"density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [16, 16]}
-    data = {"dim": 2, "gravity": [0.0, -9.81], "time": {"end": 1.0, "dt": 0.01}, "fluid": fluid}
+    data = {
+        "dim": 2,
+        "gravity": [0.0, -9.81],
+        "time": {"end": 1.0, "dt": 0.01, "integrator": "newmark"},
+        "fluid": fluid,
+    }
     sim = run(data | {"solids": {"beam": solid}, "obstacles": walls}, 5)
     wide = 0.83 - 0.17
     assert sim.regions.volumes == pytest.approx([wide * 0.445, wide * 0.545], rel=1e-4)

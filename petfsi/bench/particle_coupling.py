@@ -90,7 +90,7 @@ def scene(ratio: float, young: float, viscosity: float, scheme: str, dt: float, 
     body: dict[str, Any] = {"density": ratio * DENSITY, "young": young, "poisson": 0.3}
     body["shape"] = {"box": {"origin": [0.35, 0.4], "size": [0.3, 0.2], "cells": [6, 4]}}
     body["initial"] = {"velocity": [f"{SPEED}*(1 - 3*(y - 0.5))", f"{3 * SPEED}*(x - 0.5)"]}
-    time = {"end": end, "dt": dt, "integrator": scheme}
+    time = {"end": end, "dt": dt, "integrator": scheme, "energy_limit": -1}
     return {"dim": 2, "time": time, "fluid": fluid, "solids": {"body": body}}
 
 

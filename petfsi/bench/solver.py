@@ -83,6 +83,7 @@ def scene(case: Case, n: int, ratio: float, stiffness: float, dt: float, solid: 
     speed = 0.1 * dx / dt
     sets: dict[str, Any] = {
         "time.dt": dt,
+        "time.integrator": "bdf2",
         "time.end": 10 * dt,
         "gravity": [0.0, 0.0, 0.0],
         "fluid.size": [LENGTH] * 3,

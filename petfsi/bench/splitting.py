@@ -127,6 +127,7 @@ class Layer:
             "fluid.cells": [1, self.cells],
             "coupling.transfer": "ray",
             "time.integrator": "newmark",
+            "time.energy_limit": -1,  # it is to grow
             "fluid.initial.velocity": [0.0, SPEED],
             "solids.layer.shape": shape,
             "solids.layer.density": self.density,

@@ -95,6 +95,6 @@ def _picture(report: Report) -> Figure:
     return figure
 
 
-def _steps(rate: int) -> dict[str, float]:
+def _steps(rate: int) -> dict[str, object]:
     """Return the settings of so many steps a second, none of which is taken again in halves."""
-    return {"time.dt": 1 / rate, "time.retries": 0}
+    return {"time.dt": 1 / rate, "time.retries": 0, "time.integrator": "bdf2", "time.energy_limit": -1}

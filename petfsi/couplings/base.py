@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from petfsi.fields.base import Work
+from petfsi.fields.base import Forces, Work
 
 if TYPE_CHECKING:
     from petfsi.couplings.enclosure import Enclosure
@@ -65,6 +65,13 @@ class Coupling(ABC):
         """
         return None
 
+    def outflow(self) -> np.ndarray:
+        """Return what solids' walls let out of this rank's unknowns of the fluid at their present velocity. Collective.
+
+        In m^3/s (m^2/s in 2D), through the walls that ``couple`` saw last.
+        """
+        raise NotImplementedError
+
     def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
         """Return by unknown of the fluid what prescribed points let out in the step assembled, m^3/s (m^2/s in 2D).
 
@@ -88,19 +95,29 @@ class Coupling(ABC):
     def restored(self) -> None:  # noqa: B027 - most have nothing to tell
         """Tell fields of each other what they need after ``restore``. Collective."""
 
-    @abstractmethod
-    def work(self, pressure: np.ndarray, dt: float) -> Work:
-        """Return this rank's share of what the coupling's own forces did in the step last accepted.
+    def work(self) -> Work:
+        """Return this rank's share of what was done in the whole step last accepted, see ``power`` and ``forces``."""
+        return Work()
 
-        Supports bear the pressure on prescribed points, and the fluid's weight there: minus that is their work. What
+    def power(self, pressure: np.ndarray) -> Work:
+        """Return this rank's share of the power of the coupling's own forces where the integrator took them, W.
+
+        Supports bear the pressure on prescribed points, and the fluid's weight there: minus that is their power. What
         comes into cells from nowhere (``PressureFluid.source``) brings its volume times the pressure.
 
         Parameters
         ----------
         pressure : ndarray
             The step's solution, Pa.
-        dt : float
         """
+        return Work()
+
+    def forces(self) -> Forces:
+        """Return what the coupling's own forces did to the solid's unknowns in the step last accepted.
+
+        Under names that are among the solid's own.
+        """
+        return {}
 
     @abstractmethod
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:

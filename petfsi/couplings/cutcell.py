@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.enclosure import Enclosure
-from petfsi.fields.base import SolidField, Work
+from petfsi.fields.base import Forces, SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
 from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface
@@ -207,6 +207,10 @@ class CutCellCoupling(Coupling):
             self.fluid.cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved
         )
 
+    def outflow(self) -> np.ndarray:
+        """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
+        return self._point_flux @ self.solid.surface_velocity().ravel()
+
     def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
         """Return by unknown of the fluid what prescribed points let out, of all or of some of them."""
         if not self.surface.fixed_map.nnz:
@@ -222,16 +226,18 @@ class CutCellCoupling(Coupling):
         """Make the operators anew, and the fluid's cells with them, in the next step."""
         self._positions = None
 
-    def work(self, pressure: np.ndarray, dt: float) -> Work:
-        """Return the work of the fluid's weight on all points, and what is done against it and the pressure.
+    def forces(self) -> Forces:
+        """Return the fluid's weight on the points that are free."""
+        return {} if self.fluid.weight is None else {"gravity": self._weight @ self.fluid.weight.gradient}
+
+    def power(self, pressure: np.ndarray) -> Work:
+        """Return the power of the fluid's weight on prescribed points, and what is done against it and the pressure.
 
         By supports, and by what comes into cells from nowhere.
         """
-        held = free = 0.0
+        held = 0.0
         if self.fluid.weight is not None:
-            gradient = self.fluid.weight.gradient
-            free = float(self.solid.moved @ (self._weight @ gradient))
-            held = dt * float(self._held @ (self._point_weight @ gradient))
+            held = float(self._held @ (self._point_weight @ self.fluid.weight.gradient))
         pressed, outflow = 0.0, np.zeros_like(pressure)
         if self.surface.fixed_map.nnz:
             outflow += self._held_outflow
@@ -240,8 +246,8 @@ class CutCellCoupling(Coupling):
         if self.surface.fixed_map.nnz or self.fluid.source is not None:
             if self.fluid.slivers is not None:
                 outflow += self.fluid.spread(outflow, only_thin=False)
-            pressed = dt * float(pressure @ outflow)
-        return Work(gravity=free + held, boundary=-pressed - held)
+            pressed = float(pressure @ outflow)
+        return Work(gravity=held, boundary=-pressed - held)
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Do nothing: no face takes its velocity from the solid."""

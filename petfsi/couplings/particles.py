@@ -64,10 +64,11 @@ class PressureTransfer(Coupling):
         self._lead, self._lag = 1.0, np.zeros_like(self.skin.last)
 
     def _take(self, surface: Surface) -> None:
-        """Take the surface's maps, and their transpose for this rank's unknowns."""
+        """Take the surface's maps, and their transposes for this rank's unknowns."""
         layout = self.solid.layout
         self.surface = surface
         self._to_unknowns = surface.point_map[:, layout.start : layout.end].T.tocsr()
+        self._to_held = surface.fixed_map[:, layout.start : layout.end].T.tocsr()
 
     def couple(self, time: float, dt: float) -> None:
         """Bring the surface to where its velocity takes it in the step, and find the forces there. Collective."""
@@ -126,13 +127,12 @@ class PressureTransfer(Coupling):
     def rewind(self) -> None:
         """Forget nothing: where the surface is, is asked for in each step."""
 
-    def work(self, pressure: np.ndarray, dt: float) -> Work:
-        """Return what supports did against the force on what they hold, this rank's share: all of it on rank 0."""
-        if not self.surface.fixed_map.nnz or self.comm.rank:
+    def work(self) -> Work:
+        """Return what supports did against the mean force on what they hold, along its way."""
+        if not self.surface.fixed_map.nnz:
             return Work()
-        held = self.surface.fixed_map @ self.solid.fixed_velocity()
-        force = self._lead * self._mean - self._lag + self.skin.to_points(self.skin.drag)
-        return Work(boundary=-dt * float(force.ravel() @ held))
+        force = self._mean + self.skin.to_points(self.skin.drag)
+        return Work(boundary=-float(self.solid.moved @ (self._to_held @ force.ravel())))
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give particles what the new velocity changes, and tell the fluid where the surface is. Collective."""

@@ -230,6 +230,10 @@ class RayCoupling(Coupling):
             self._held_outflow = self._point_flux @ self._held
             self.fluid.rhs -= self._held_outflow
 
+    def outflow(self) -> np.ndarray:
+        """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
+        return self._point_flux @ self.solid.surface_velocity().ravel()
+
     def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
         """Return by unknown of the fluid what prescribed points let out, of all or of some of them."""
         if not self.surface.fixed_map.nnz:
@@ -245,10 +249,10 @@ class RayCoupling(Coupling):
         """Make the operators anew, and the fluid's cells with them, in the next step."""
         self._positions = None
 
-    def work(self, pressure: np.ndarray, dt: float) -> Work:
+    def power(self, pressure: np.ndarray) -> Work:
         """Return what supports do against the pressure, as the fluid feels it."""
         held = self._held_outflow
-        return Work(boundary=-dt * float(pressure @ held) if len(held) else 0.0)
+        return Work(boundary=-float(pressure @ held) if len(held) else 0.0)
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give the faces that the solid took its new velocity, in ghosts, too."""

@@ -82,10 +82,11 @@ class RepulsionTransfer(Coupling):
         self._tell_of_near(points)
 
     def _take(self, surface: Surface) -> None:
-        """Take the surface's maps, and their transpose for this rank's unknowns."""
+        """Take the surface's maps, and their transposes for this rank's unknowns."""
         layout = self.solid.layout
         self.surface = surface
         self._to_unknowns = surface.point_map[:, layout.start : layout.end].T.tocsr()
+        self._to_held = surface.fixed_map[:, layout.start : layout.end].T.tocsr()
 
     def _tell_of_near(self, points: np.ndarray) -> None:
         """Note how many particles begin where they are pushed off at once. Collective."""
@@ -149,14 +150,15 @@ class RepulsionTransfer(Coupling):
     def rewind(self) -> None:
         """Forget nothing: where the surface is, is asked for in each step."""
 
-    def work(self, pressure: np.ndarray, dt: float) -> Work:
-        """Return this rank's share of what supports did against the force on what they hold, and pairs took.
+    def work(self) -> Work:
+        """Return what supports did against the mean force on what they hold, along its way, and what pairs took.
 
         ``damping`` is what both sides of the pairs lost: with it what they store, which comes back.
         """
-        held = self.surface.fixed_map @ self.solid.fixed_velocity() if self.surface.fixed_map.nnz else None
-        boundary = 0.0 if held is None or self.comm.rank else -dt * float(self._mean.ravel() @ held)
-        return Work(boundary=boundary, damping=self._taken)
+        return Work(
+            boundary=-float(self.solid.moved @ (self._to_held @ self._mean.ravel())),
+            damping=self._taken,
+        )
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give particles what the new velocity changes. Collective."""

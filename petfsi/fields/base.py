@@ -59,7 +59,7 @@ class Stock:
 
 @dataclass(frozen=True)
 class Work:
-    """What the last step's forces did, this rank's share, J.
+    """What the last step's forces did, this rank's share, J; or do in a second, W.
 
     Attributes
     ----------
@@ -97,6 +97,9 @@ class Landing:
     stride: float
     swings: bool
 
+
+#: Forces on a solid's unknowns on this rank, flat, N, by the name of what they do in ``Work``.
+Forces = dict[str, np.ndarray]
 
 #: Reads the piece ``[start, start + count)`` of the stored array of that name: ``read(name, start, count)``.
 Reader = Callable[[str, tuple[int, ...], tuple[int, ...]], np.ndarray]
@@ -209,9 +212,19 @@ class Field(ABC):
     def stock(self) -> Stock:
         """Return this rank's share of momentum and energy. Collective, without a reduction."""
 
-    @abstractmethod
     def work(self, dt: float) -> Work:
-        """Return this rank's share of what was done in the step last accepted. Collective, without a reduction."""
+        """Return this rank's share of what was done in the whole step last accepted. Collective, without a reduction.
+
+        Without that of ``power`` and of ``SolidField.forces``, of which who keeps the books makes work.
+        """
+        return Work()
+
+    def power(self) -> Work:
+        """Return this rank's share of the power where the integrator took the forces of the step last accepted, W.
+
+        Collective, without a reduction.
+        """
+        return Work()
 
     @abstractmethod
     def output(self) -> dict[str, Slab]:
@@ -308,8 +321,16 @@ class PressureFluid(FluidField):
         """Return by unknown what the step lets in through sides with a given velocity; None if there are none."""
 
     @abstractmethod
+    def net_outflow(self) -> np.ndarray:
+        """Return by unknown what leaves it at the present velocity but through solids' walls, m^3/s (m^2/s in 2D)."""
+
+    @abstractmethod
+    def push(self, x: np.ndarray, dt: float) -> None:
+        """Change the present velocity as the pressure x (SI) would in a first step of dt. Collective."""
+
+    @abstractmethod
     def inflows(self) -> dict[str, np.ndarray]:
-        """Return the same by the key of each side that lets anything in. Not collective."""
+        """Return what ``inflow`` does by the key of each side that lets anything in. Not collective."""
 
     @abstractmethod
     def rehearse(self, time: float, dt: float) -> None:
@@ -341,12 +362,15 @@ class SolidField(Field):
         By how much this rank's nodes moved in the step last accepted, m.
     is_linear : bool
         Whether its tangent never changes, and neither does the stable step.
+    acting : tuple of str
+        The names in ``forces``, the same in every step and on every rank.
     """
 
     elastic = True
     names: list[str]
     extent: float
     moved: np.ndarray
+    acting: tuple[str, ...] = ()
     is_linear: bool = False
 
     @property
@@ -410,15 +434,19 @@ class SolidField(Field):
         """Return the wet surface, the same on every rank; another object where its maps have changed. Collective."""
 
     @abstractmethod
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points as numbered in the scene, ascending in each part. Not collective."""
+
+    @abstractmethod
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points supports hold where they are, along all axes. Not collective."""
+
+    @abstractmethod
     def surface_positions(self) -> np.ndarray:
         """Return the positions of its points, shape (n_points, dim), on every rank. Collective.
 
         Between ``predict`` and ``accept`` those at which the step's equations are taken, otherwise the present ones.
         """
-
-    @abstractmethod
-    def surface_bodies(self) -> np.ndarray:
-        """Return which body each point of the surface belongs to, by its place in ``names``, on every rank."""
 
     @abstractmethod
     def surface_present(self) -> np.ndarray:
@@ -439,6 +467,10 @@ class SolidField(Field):
         """
 
     @abstractmethod
+    def push(self, change: np.ndarray) -> None:
+        """Change the present velocities by this much (SI, by unknown)."""
+
+    @abstractmethod
     def landing(self, dt: float) -> Landing:
         """Return how a step of dt brings nodes to its end."""
 
@@ -452,6 +484,25 @@ class SolidField(Field):
     @abstractmethod
     def fixed_velocity(self) -> np.ndarray:
         """Return what the step prescribes of its solution by unknown, zero where free, on every rank."""
+
+    @abstractmethod
+    def forces(self) -> Forces:
+        """Return what acted from outside in the step last accepted, where the integrator took it. Collective.
+
+        Gravity, loads, and the reactions of supports without what other fields do to them.
+        """
+
+    @abstractmethod
+    def starting_forces(self) -> Forces:
+        """Return the same of the present state at time zero, reactions in statics alone: it is at rest. Collective."""
+
+    @abstractmethod
+    def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:
+        """Return a value per unknown on this rank as pieces of global arrays. Collective."""
+
+    @abstractmethod
+    def read_stored(self, read: Reader, name: str) -> np.ndarray:
+        """Return what ``stored`` gave, on any number of ranks. Collective."""
 
     @abstractmethod
     def probe(self, body: str, at: list[float], quantity: str) -> np.ndarray:

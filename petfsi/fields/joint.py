@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from mpi4py import MPI
@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix, vstack
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Landing, Reader, Slab, SolidField, Stock, Work
+from petfsi.fields.base import Forces, Landing, Reader, Slab, SolidField, Stock, Work
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, slab
@@ -70,6 +70,8 @@ class JointSolid(SolidField):
         self._number = _stacked_numbers(comm, counts)
         self.rhs = np.zeros(self.layout.n_local)
         self.moved = np.zeros(self.layout.n_local)
+        acting = {name for part in self.parts for name in part.acting}
+        self.acting = tuple(sorted(acting))
         self._set_block()
         nodes = [part.layout.n_global // part.width for part in self.parts]
         self.set_scale(float(np.average([part.mean_mass for part in self.parts], weights=nodes)))
@@ -150,6 +152,11 @@ class JointSolid(SolidField):
         for part, mine in self._split(x):
             part.accept(mine, time, dt)
         self.moved = np.concatenate([part.moved for part in self.parts])
+
+    def push(self, change: np.ndarray) -> None:
+        """Change the velocities of every part by its share."""
+        for part, mine in self._split(change):
+            part.push(mine)
 
     def rewind(self) -> None:
         """Forget the step begun, in every part."""
@@ -250,14 +257,19 @@ class JointSolid(SolidField):
         ]
         return vstack(renumbered, format="csr")
 
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points as numbered in the scene."""
+        numbers = [np.array([self.names.index(name) for name in part.names]) for part in self.parts]
+        every = zip(numbers, self.parts, strict=True)
+        return np.concatenate([number[part.surface_bodies()] for number, part in every])
+
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points supports hold where they are, along all axes."""
+        return np.concatenate([part.surface_rooted() for part in self.parts])
+
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, dim). Collective."""
         return np.concatenate([part.surface_positions() for part in self.parts])
-
-    def surface_bodies(self) -> np.ndarray:
-        """Return which body each point of the surface belongs to."""
-        numbers = [np.array([self.names.index(name) for name in part.names]) for part in self.parts]
-        return np.concatenate([n[part.surface_bodies()] for n, part in zip(numbers, self.parts, strict=True)])
 
     def surface_present(self) -> np.ndarray:
         """Return the present positions of its points, shape (n_points, dim). Collective."""
@@ -295,15 +307,29 @@ class JointSolid(SolidField):
         momentum = np.sum([s.momentum for s in stocks], axis=0)
         return Stock(momentum, sum(s.kinetic for s in stocks), sum(s.elastic for s in stocks))
 
+    def forces(self) -> Forces:
+        """Return what acted on all parts in the step last accepted. Collective."""
+        return self._together([part.forces() for part in self.parts])
+
+    def starting_forces(self) -> Forces:
+        """Return what acts on all parts at time zero. Collective."""
+        return self._together([part.starting_forces() for part in self.parts])
+
+    def _together(self, every: list[Forces]) -> Forces:
+        given = {name for forces in every for name in forces}
+        total = {name: np.zeros(self.layout.n_local) for name in self.acting if name in given}
+        for piece, forces in zip(self._pieces, every, strict=True):
+            for name, force in forces.items():
+                total[name][piece] = force
+        return total
+
     def work(self, dt: float) -> Work:
         """Return this rank's share of what was done to all parts in the step last accepted."""
-        works = [part.work(dt) for part in self.parts]
-        return Work(
-            gravity=sum(w.gravity for w in works),
-            damping=sum(w.damping for w in works),
-            boundary=sum(w.boundary for w in works),
-            loads=sum(w.loads for w in works),
-        )
+        return Work(damping=sum(part.work(dt).damping for part in self.parts))
+
+    def power(self) -> Work:
+        """Return this rank's share of the power on all parts in the step last accepted, W."""
+        return Work(damping=sum(part.power().damping for part in self.parts))
 
     def probe(self, body: str, at: list[float], quantity: str) -> np.ndarray:
         """Return a quantity of a body's material point. Collective."""
@@ -332,15 +358,32 @@ class JointSolid(SolidField):
             body.append(Slab(own[out["body"].data], out["body"].start, out["body"].shape))
         return {"cells": stack(cells), "body": stack(body)}
 
+    def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:
+        """Return a value per unknown of all parts. Collective."""
+        parts = zip(self.kinds, self._split(x), strict=True)
+        return {f"{kind}_{name}": part.stored(name, mine)[name] for kind, (part, mine) in parts}
+
+    def read_stored(self, read: Reader, name: str) -> np.ndarray:
+        """Return what ``stored`` gave. Collective."""
+        return np.concatenate([part.read_stored(_prefixed(read, kind), name) for kind, part in self._by_kind()])
+
+    def _by_kind(self) -> Iterator[tuple[str, NodalSolid]]:
+        return zip(self.kinds, self.parts, strict=True)
+
     def state(self) -> dict[str, Slab]:
         """Return the state of all parts. Collective."""
-        states = [(kind, part.state()) for kind, part in zip(self.kinds, self.parts, strict=True)]
+        states = [(kind, part.state()) for kind, part in self._by_kind()]
         return {f"{kind}_{name}": piece for kind, state in states for name, piece in state.items()}
 
     def restore(self, read: Reader) -> None:
         """Take the state of all parts back. Collective."""
-        for kind, part in zip(self.kinds, self.parts, strict=True):
-            part.restore(lambda name, start, count, kind=kind: read(f"{kind}_{name}", start, count))  # type: ignore[misc]
+        for kind, part in self._by_kind():
+            part.restore(_prefixed(read, kind))
+
+
+def _prefixed(read: Reader, kind: str) -> Reader:
+    """Return the reader of the arrays of one kind."""
+    return lambda name, start, count: read(f"{kind}_{name}", start, count)
 
 
 class _Stack:

@@ -14,7 +14,9 @@ from petfsi.geometry.balls import unit_ball
 from petfsi.geometry.meshes import read_surface
 from petfsi.geometry.seams import MEET, Seams, find_seams
 from petfsi.geometry.surfaces import boundary_facets
+from petfsi.scene.fluids import InflowSide, MovingSide
 from petfsi.scene.schema import Obstacle, Scene
+from petfsi.scene.shape_checks import OPPOSITE
 from petfsi.scene.tables import Ball, Box, Cylinder, Halfspace
 
 #: The most facets that one round obstacle is made of.
@@ -61,26 +63,66 @@ def obstacle_surfaces(scene: Scene) -> ObstacleSurfaces:
     """
     fluid = scene.fluid
     assert fluid is not None, "only a fluid feels obstacles"
-    low, size = np.array(fluid.origin), np.array(fluid.size)
-    spacing = fluid.resolution
-    periodic = [getattr(fluid.sides, side) == "periodic" for side in ("left", "bottom", "back")[: scene.dim]]
-    points, facets, mistakes, count = [np.zeros((0, scene.dim))], [np.zeros((0, scene.dim), dtype=np.int64)], [], 0
-    for name, obstacle in scene.obstacles.items():
-        where = (f"obstacles.{name}.shape", scene.directory)
-        try:
-            x, f = obstacle_surface(obstacle, scene.dim, spacing, low, low + size, *where, periodic)
-            _check_length(x, size, periodic, where[0])
-        except InputError as error:
-            mistakes.append(str(error))
-            continue
+    points, facets, count = [np.zeros((0, scene.dim))], [np.zeros((0, scene.dim), dtype=np.int64)], 0
+    for x, f in named_surfaces(scene).values():
         points.append(x)
         facets.append(f + count)
         count += len(x)
-    if mistakes:
-        raise InputError("\n".join(mistakes))
     base = sum(obstacle.outside for obstacle in scene.obstacles.values())
     every = np.concatenate(points), np.concatenate(facets)
-    return ObstacleSurfaces(*every, base, find_seams(*every, size, np.array(periodic)))
+    return ObstacleSurfaces(*every, base, find_seams(*every, np.array(fluid.size), np.array(_periodic(scene))))
+
+
+def named_surfaces(scene: Scene) -> dict[str, SurfaceMesh]:
+    """Return the surface of each obstacle of a scene with a fluid. Not collective; raises as ``obstacle_surfaces``."""
+    fluid = scene.fluid
+    assert fluid is not None, "only a fluid feels obstacles"
+    low, size, periodic = np.array(fluid.origin), np.array(fluid.size), _periodic(scene)
+    found, mistakes = {}, []
+    for name, obstacle in scene.obstacles.items():
+        where = (f"obstacles.{name}.shape", scene.directory)
+        try:
+            found[name] = obstacle_surface(obstacle, scene.dim, fluid.resolution, low, low + size, *where, periodic)
+            _check_length(found[name][0], size, periodic, where[0])
+        except InputError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return found
+
+
+def _periodic(scene: Scene) -> list[bool]:
+    sides = scene.fluid.sides if scene.fluid is not None else None
+    return [getattr(sides, side, None) == "periodic" for side in ("left", "bottom", "back")[: scene.dim]]
+
+
+def side_walls(scene: Scene) -> dict[str, SurfaceMesh]:
+    """Return what stands behind the sides of the fluid's box that are walls: blocks as thick as the box is long.
+
+    They fill the corners between them; beyond an open side there are none. An inflow is a wall unless the rest of its
+    side is open.
+    """
+    fluid = scene.fluid
+    if fluid is None:
+        return {}
+    low, found = np.array(fluid.origin, dtype=float), {}
+    high = low + fluid.size
+    thick = float(np.linalg.norm(high - low))
+    walls = [[_is_wall(getattr(fluid.sides, side)) for side in pair] for pair in OPPOSITE[: scene.dim]]
+    begin, end = low - thick * np.array(walls)[:, 0], high + thick * np.array(walls)[:, 1]
+    for axis, pair in enumerate(OPPOSITE[: scene.dim]):
+        for side, which in zip(pair, (0, 1), strict=True):
+            if walls[axis][which]:
+                corners = begin.copy(), end.copy()
+                corners[1 - which][axis] = (low, high)[which][axis]
+                found[side] = _block(corners[0], np.diag(corners[1] - corners[0]))
+    return found
+
+
+def _is_wall(side: str | InflowSide | MovingSide) -> bool:
+    if isinstance(side, InflowSide):
+        return side.inflow.region is None or side.inflow.rest != "open"
+    return side not in ("open", "periodic")
 
 
 def _check_length(points: np.ndarray, size: np.ndarray, periodic: Sequence[bool], key: str) -> None:

@@ -14,7 +14,16 @@ import numpy as np
 from petfsi.errors import InputError
 from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.fluids import Fluid, GridInflow, Inflow, InflowSide, MacFluid, MovingSide
+from petfsi.scene.fluids import (
+    Fluid,
+    GridInflow,
+    Inflow,
+    InflowSide,
+    MacFluid,
+    MovingSide,
+    PressureSide,
+    open_side,
+)
 from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.particle_checks import particles
@@ -36,6 +45,7 @@ from petfsi.scene.shape_checks import (
     sizes,
     solid_shape,
 )
+from petfsi.scene.side_checks import grid_sides
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Halfspace
 
@@ -181,7 +191,7 @@ def _jets(scene: Scene, inflows: list[tuple[str, Inflow]]) -> Problems:
         if inflow.smoke > 0 and fluid.smoke is None:
             allowed = "smoke needs a table [fluid.smoke] (it may be empty)"
             yield Problem(f"fluid.sides.{side}.inflow.smoke", inflow.smoke, allowed, ("fluid.smoke",))
-    leaves = any(form == "open" for _, form in fluid.sides) or any(inflow.rest == "open" for _, inflow in inflows)
+    leaves = any(open_side(form) is not None for _, form in fluid.sides)
     if len(inflows) == 1 and not leaves and not scene.solids:
         allowed = 'what flows in must be able to leave: make a side open, or set rest = "open" here'
         yield Problem(f"fluid.sides.{inflows[0][0]}.inflow", ABSENT, allowed, ("fluid.sides", "solids"))
@@ -298,7 +308,14 @@ def expressions(scene: Scene) -> Iterator[tuple[str, float | str, tuple[str, ...
             yield "fluid.smoke.initial", scene.fluid.smoke.initial, space
         for side, form in scene.fluid.sides:
             if isinstance(form, InflowSide):
-                yield f"fluid.sides.{side}.inflow.speed", form.inflow.speed, (*space, "t")
+                key = f"fluid.sides.{side}.inflow"
+                yield f"{key}.speed", form.inflow.speed, (*space, "t")
+                if isinstance(form.inflow, GridInflow):
+                    yield from each(f"{key}.along", form.inflow.along, (*space, "t"))
+                    if isinstance(form.inflow.rest, PressureSide):
+                        yield f"{key}.rest.pressure", form.inflow.rest.pressure, (*space, "t")
+            elif isinstance(form, PressureSide):
+                yield f"fluid.sides.{side}.pressure", form.pressure, (*space, "t")
             elif isinstance(form, MovingSide):
                 yield from each(f"fluid.sides.{side}.no-slip.velocity", form.no_slip.velocity, (*space, "t"))
     for name, solid in scene.solids.items():
@@ -335,6 +352,7 @@ CHECKS: tuple[Callable[[Scene], Problems], ...] = (
     _fluid,
     _transfer,
     _sides,
+    grid_sides,
     particles,
     _solids,
     _obstacles,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator
 from pydantic_core import PydanticCustomError
@@ -17,14 +17,72 @@ class Inflow(Table):
     speed: Annotated[Number, Field(description="m/s into the domain; may depend on x, y, z, t")]
     region: Annotated[Shape | None, Field(description="the part of the side in this shape, or all of it")] = None
     ramp: Annotated[Real, Field(ge=0, description="s over which the speed grows smoothly from zero")] = 0.0
-    rest: Annotated[str, Field(description="what the remainder of the side is")] = "slip"
+    rest: Annotated[Any, Field(description="what the remainder of the side is")] = "slip"
+
+
+#: What a given pressure is where fluid comes in: the static one, or static and kinetic energy together.
+Entering = Annotated[Literal["static", "total"], Field(description="what the pressure is of fluid that comes in")]
+
+
+class PressureSide(Table):
+    """A side that fluid passes through, with a given pressure."""
+
+    form: ClassVar[str] = "<pressure>"
+
+    pressure: Annotated[Number, Field(description="Pa; may depend on x, y, z, t")]
+    entering: Entering = "static"
+
+
+class HydrostaticSide(Table):
+    """A side that fluid passes through, with the pressure of a fluid at rest beyond it."""
+
+    form: ClassVar[str] = "<hydrostatic>"
+
+    hydrostatic: Annotated[Real, Field(description="m, how high against gravity the fluid beyond stands")]
+    entering: Entering = "static"
+
+
+class OpenSide(NamedTuple):
+    """What an open side of a grid is: a pressure (Pa), and that of a fluid at rest up to a level (m) where it says so.
+
+    Without a level the fluid beyond stands as high as the grid.
+    """
+
+    pressure: Number = 0.0
+    hydrostatic: bool = False
+    level: float | None = None
+    total: bool = False
+
+
+def _open_form(value: Any) -> str | None:
+    """Tell the forms of an open side apart: by the key of a table."""
+    if not isinstance(value, dict):
+        return getattr(value, "form", "<name>")
+    found = [key for key in ("pressure", "hydrostatic") if key in value]
+    return f"<{found[0]}>" if len(found) == 1 else None
+
+
+Rest = Annotated[
+    Annotated[Literal["slip", "open", "hydrostatic"], Tag("<name>")]
+    | Annotated[PressureSide, Tag(PressureSide.form)]
+    | Annotated[HydrostaticSide, Tag(HydrostaticSide.form)],
+    Discriminator(
+        _open_form,
+        custom_error_type="side",
+        custom_error_message="must be 'slip', 'open' or 'hydrostatic', or a table of pressure or hydrostatic",
+    ),
+    Field(description="what the remainder of the side is"),
+]
 
 
 class GridInflow(Inflow):
     """A jet into a grid."""
 
+    along: Annotated[
+        list[Number] | None, Field(description="m/s along the side that is carried in; may depend on x, y, z, t")
+    ] = None
     smoke: Annotated[Real, Field(ge=0, description="smoke carried in")] = 0.0
-    rest: Annotated[Literal["slip", "open"], Field(description="what the remainder of the side is")] = "slip"
+    rest: Rest = "slip"
 
 
 class ParticleInflow(Inflow):
@@ -41,6 +99,8 @@ class InflowSide(Table):
 
 class GridInflowSide(InflowSide):
     """That of a side of a grid."""
+
+    form: ClassVar[str] = "<inflow>"
 
     inflow: GridInflow
 
@@ -67,9 +127,11 @@ class MovingSide(Table):
     no_slip: Annotated[Plate, Field(alias="no-slip")]
 
 
-def _side_form(value: Any) -> str:
-    """Tell the two forms of a side apart by their type, so that errors speak of one form only."""
-    return "<table>" if isinstance(value, dict | InflowSide) else "<name>"
+def _grid_side_form(value: Any) -> str | None:
+    """Tell the forms of a side of a grid apart: by the key of a table."""
+    if isinstance(value, dict) and "inflow" in value:
+        return None if "pressure" in value or "hydrostatic" in value else GridInflowSide.form
+    return _open_form(value)
 
 
 def _particle_side_form(value: Any) -> str | None:
@@ -86,10 +148,28 @@ def at_rest(side: str | InflowSide | MovingSide) -> str | InflowSide:
     return "no-slip" if isinstance(side, MovingSide) else side
 
 
+def open_side(side: Side) -> OpenSide | None:
+    """Return what a side of a grid is that fluid may pass through both ways, or the rest of one with a jet, or None."""
+    form = side.inflow.rest if isinstance(side, GridInflowSide) else side
+    if isinstance(form, PressureSide):
+        return OpenSide(form.pressure, total=form.entering == "total")
+    if isinstance(form, HydrostaticSide):
+        return OpenSide(0.0, True, form.hydrostatic, form.entering == "total")
+    return {"open": OpenSide(), "hydrostatic": OpenSide(hydrostatic=True)}.get(form)
+
+
 Side = Annotated[
-    Annotated[Literal["slip", "open", "periodic"], Tag("<name>")] | Annotated[GridInflowSide, Tag("<table>")],
-    Discriminator(_side_form),
-    Field(description="or { inflow = { speed = ... } }"),
+    Annotated[Literal["slip", "open", "hydrostatic", "periodic"], Tag("<name>")]
+    | Annotated[GridInflowSide, Tag(GridInflowSide.form)]
+    | Annotated[PressureSide, Tag(PressureSide.form)]
+    | Annotated[HydrostaticSide, Tag(HydrostaticSide.form)],
+    Discriminator(
+        _grid_side_form,
+        custom_error_type="side",
+        custom_error_message="must be 'slip', 'open', 'hydrostatic' or 'periodic', or a table of one of inflow, "
+        "pressure and hydrostatic",
+    ),
+    Field(description="or { inflow = { speed = ... } }, { pressure = ... }, { hydrostatic = ... }"),
 ]
 
 ParticleSide = Annotated[

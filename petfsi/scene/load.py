@@ -19,7 +19,7 @@ from petfsi.scene.schema import Scene
 __all__ = ["RESUMABLE", "apply_set", "dump_scene", "load_scene", "parse_value", "scene_from_dict"]
 
 #: What may be changed when a run is resumed: nothing that the state at hand depends on.
-RESUMABLE = ("time.end", "output", "checkpoint")
+RESUMABLE = ("time.end", "time.energy_limit", "output", "checkpoint")
 
 MAX_LINES = 40
 

@@ -26,11 +26,19 @@ class Time(Table):
 
     end: Annotated[Real, Field(gt=0, description="s")]
     dt: Annotated[Number, Field(description="s")]
-    integrator: Annotated[str, BeforeValidator(one_of(INTEGRATORS))] = "newmark"
+    integrator: Annotated[str, BeforeValidator(one_of(INTEGRATORS))] = "bdf2"
     above_limit: Annotated[
         Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
     ] = "refuse"
     retries: Annotated[Whole, Field(ge=0, le=20, description="how often a step that fails is halved")] = 3
+    energy_limit: Annotated[Real, Field(description="part of its energy that may come out of nothing; -1: any")] = 1.0
+
+    @field_validator("energy_limit")
+    @classmethod
+    def _part_or_any(cls, limit: float) -> float:
+        if limit < 0 and limit != -1:
+            raise PydanticCustomError("energy_limit", "must be 0 or more, or -1")
+        return limit
 
     @field_validator("dt")
     @classmethod

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from petfsi.scene.fluids import Fluid
+from petfsi.scene.fluids import Fluid, HydrostaticSide, PressureSide
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.tables import Box, Shape
 
@@ -196,6 +196,11 @@ def _core(shape: Shape, dim: int) -> tuple[np.ndarray, np.ndarray]:
     return (low, high) if shape.ball is None else (0.5 * (low + high), 0.5 * (low + high))
 
 
+def passes(side: object) -> bool:
+    """Whether all of a side lets fluid and floats through, both ways."""
+    return side in ("open", "hydrostatic") or isinstance(side, PressureSide | HydrostaticSide)
+
+
 def outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[float]) -> Problems:
     """Yield a problem if a bounding box does not lie in the grid, but for what reaches through an open side.
 
@@ -214,7 +219,7 @@ def outside_grid(fluid: Fluid, key: str, low: Sequence[float], high: Sequence[fl
                 yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.size", "fluid.sides"))
             continue
         # floats: a part of it at least must be in the grid
-        through = [getattr(fluid.sides, side) == "open" and a < end and b > start for side in sides]
+        through = [passes(getattr(fluid.sides, side)) and a < end and b > start for side in sides]
         if (a < start - slack and not through[0]) or (b > end + slack and not through[1]):
             allowed = f"{axis} must lie inside the fluid's grid, {start:g} to {end:g} m"
             yield Problem(key, f"{axis} from {a:g} to {b:g} m", allowed, ("fluid.origin", "fluid.size"))

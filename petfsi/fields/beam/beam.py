@@ -187,6 +187,14 @@ class BeamSolid(NodalSolid):
         indptr = np.concatenate(([0], np.cumsum(chosen.sum(axis=1)))).astype(IntType)
         return csr_matrix((values[chosen], self._columns[chosen], indptr), shape=(len(chosen), self.layout.n_global))
 
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points."""
+        return np.repeat(self._node_body, 2)
+
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points are at nodes that supports hold where they are, whether these turn or not."""
+        return np.repeat(self._still_nodes(), 2)
+
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, 2). Collective.
 
@@ -202,10 +210,6 @@ class BeamSolid(NodalSolid):
     def surface_arrival(self, x: np.ndarray | None, dt: float) -> np.ndarray:
         """Return where its points are after a step of dt with the solution x (None: zero). Collective."""
         return self._outline(self._everywhere(self._destination(x, dt)))
-
-    def surface_bodies(self) -> np.ndarray:
-        """Return which beam each point of the surface belongs to: two to every node."""
-        return np.repeat(self._node_body, 2)
 
     def surface_present(self) -> np.ndarray:
         """Return the present positions of its points, shape (n_points, 2). Collective."""

@@ -164,31 +164,18 @@ class BeamElements:
         u = self._of_elements(u)
         return float(0.5 * np.sum((u * _times(self.mass, u))[counted])), float(W[counted].sum())
 
-    def powers(
-        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
-    ) -> tuple[float, float]:
-        """Return two powers of a step's forces, over the counted elements, W. Not collective.
-
-        The damping's  w . C w,  and that of the residual of A w - b without loads,
-
-            g . (M (a w - V) + C w + K(d) + K'(d) (s + k w)) .
+    def damping(self, d: np.ndarray, w: np.ndarray, counted: np.ndarray) -> float:
+        """Return what damping takes from the counted elements, w . (a0 M + a1 K'(d)) w, W. Not collective.
 
         Parameters
         ----------
-        at : State
-        a, k : float
-            1/s, s.
-        w, g : ndarray, shape (n, 3)
-            The solution, and any other velocity.
+        d, w : ndarray, shape (n, 3)
         counted : ndarray of bool, shape (ne,)
         """
-        _, f, K = self.theory.respond(self._of_elements(at.displacement))
-        w, g = self._of_elements(w), self._of_elements(g)
-        Mw, Kw = _times(self.mass, w), _times(K, w)
+        _, _, K = self.theory.respond(self._of_elements(d))
+        w = self._of_elements(w)
         a0, a1 = (x[self.body][:, None] for x in (self.sections.mass_damping, self.sections.stiffness_damping))
-        Cw = a0 * Mw + a1 * Kw
-        residual = a * Mw + Cw + k * Kw - self._loads(at, f, K)
-        return float(np.sum((w * Cw)[counted])), float(np.sum((g * residual)[counted]))
+        return float(np.sum((w * (a0 * _times(self.mass, w) + a1 * _times(K, w)))[counted]))
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:

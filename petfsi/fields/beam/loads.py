@@ -213,6 +213,10 @@ class BeamLoads:
                 scatter_matrices(cells, -k * self._tangent, pattern.node_ptr, pattern.slots[0], values)
         b += self._force
 
+    def start(self, d: np.ndarray) -> np.ndarray:
+        """Return the forces at time zero on nodes (all local ones) displaced so, at the owned ones. Collective."""
+        return agreed(self.comm, lambda: self._forces(0.0, d))
+
     def _forces(self, time: float, d: np.ndarray) -> np.ndarray:
         """Return the forces at d, and take their tangent."""
         d = d[self._elements.cells].reshape(len(self._elements.cells), -1)

@@ -42,6 +42,7 @@ class Advection:
         low = tuple(0.0 if p else float(max(0, g - m)) for p, g, m, _, _ in place)
         high = tuple(float(s) if p else float(min(s, g - m + c)) for p, g, m, c, s in place)
         self._ends = low, high
+        self._face_ends = [surroundings.carry_ends(axis, low, high) for axis in range(grid.dim)]
 
     def path(self, velocity: Faces, span: float) -> Path:
         """Return the path along a velocity for ``span`` seconds, see ``find_path``. Collective."""
@@ -87,6 +88,8 @@ class Advection:
                 for axis, v in enumerate(target):
                     grid.exchange_faces(axis, v)
                     grid.fill_sides(v, axis)
+                if self.surroundings.carries_along:
+                    self.surroundings.fill_along(target)
                 q = target
         return kept
 
@@ -165,9 +168,10 @@ class Advection:
     ) -> None:  # fmt: skip
         """Carry the faces of an axis (cells: None) for one sweep as if nothing divided them."""
         bounded = axis is None
+        ends = self._ends if axis is None else self._face_ends[axis]
         advect.sweep(
             q, out, moved, *three(path.velocity), _offset(axis), self._part(axis), sweep.courant, sweep.long,
-            *self._ends, beyond, self.cubic, bounded, sweep.limit, left,
+            *ends, beyond, self.cubic, bounded, sweep.limit, left,
         )  # fmt: skip
 
     def _rest(
@@ -207,8 +211,9 @@ class Advection:
             read = spread(read, b, sweep.reach)
         read |= where
         there = where if axis is None else faces_below(where, axis)
+        ends = self._ends if axis is None else self._face_ends[axis]
         advect.mark_read(
-            read, there, boxed, *three(path.velocity), _offset(axis), self._part(axis), sweep.courant, *self._ends,
+            read, there, boxed, *three(path.velocity), _offset(axis), self._part(axis), sweep.courant, *ends,
             beyond, STENCIL[self.interpolation],
         )  # fmt: skip
         return self._complete(read)

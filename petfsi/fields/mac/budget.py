@@ -19,6 +19,8 @@ from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid
 from petfsi.fields.mac.kinds import OPEN, PRESSURE, STEP, WALL
+from petfsi.fields.mac.open_sides import OpenSides
+from petfsi.fields.mac.sides import Surroundings
 from petfsi.fields.mac.weight import Weight
 
 
@@ -93,16 +95,20 @@ def power(
 
 def inflow(
     grid: MacGrid, density: float, velocity: Faces, kind: list[np.ndarray], openness: list[np.ndarray],
-    pressure: np.ndarray, active: np.ndarray, weight: Weight | None, extras: Extras | None, further: np.ndarray,
+    pressure: np.ndarray, active: np.ndarray, weight: Weight | None, jets: Surroundings, pressed: OpenSides,
+    extras: Extras | None, further: np.ndarray,
 ) -> float:  # fmt: skip
     """Return this rank's share of the power that comes through the sides, W. Not collective.
 
     Through jets and open sides,  sum_f q_f (p_f + rho |v|^2 / 2)  with the volume q_f that comes in a second. The
-    velocity across a face is its own, that along it the one of the cell inside. Where the pressure of the fluid at
-    rest is split off (``weight``), p is without it: this adds the potential energy of what comes and goes. Of divided
+    velocity across an open face is its own, that along it the one of the cell inside; of a jet it is what the jet has,
+    which comes through a part of a face at more than the face's own velocity. Where the pressure of the fluid at rest
+    is split off (``weight``), p is without it: this adds the potential energy of what comes and goes. Of divided
     cells, ``further`` are the pressures of the further pieces.
     """
-    total = 0.0 if extras is None else _inflow_of_parts(grid, density, velocity, pressure, weight, extras, further)
+    total = 0.0
+    if extras is not None:
+        total = _inflow_of_parts(grid, density, velocity, pressure, weight, pressed, extras, further)
     for a in range(grid.dim):
         for upper in (False, True):
             edge = (grid.hi[a] == grid.cells[a]) if upper else (grid.lo[a] == 0)
@@ -115,19 +121,28 @@ def inflow(
             at, cell = tuple(face), tuple(inner)
             is_open, is_wall = kind[a][at] == OPEN, (kind[a][at] == WALL) & active[cell]
             v = velocity[a][at]
-            if not np.any(is_open | (is_wall & (v != 0.0))):
+            given = pressed.on(a, upper)
+            if given is None and not np.any(is_open | (is_wall & (v != 0.0))):
                 continue
-            p = np.where(is_wall, pressure[cell], 0.0)
+            p, along = np.where(is_wall, pressure[cell], 0.0), _along(velocity, cell, a)
+            if given is not None:
+                p = np.where(is_open, given.acting(velocity[a][given.plane], density)[_in_plane(at, a)], p)
             if weight is not None:
                 p = p - np.where(is_open, _rest(grid, weight, a, at), _rest(grid, weight, None, cell))
             flow = np.where(is_open | is_wall, (-v if upper else v) * openness[a][at], 0.0) * grid.face_area(a)
-            total += float(np.sum(flow * (p + 0.5 * density * (v**2 + _along(velocity, cell, a)))))
+            squares = np.where(is_wall, jets.squares(a, upper, v**2, along, at), v**2 + along)
+            total += float(np.sum(flow * (p + 0.5 * density * squares)))
     return total
 
 
+def _in_plane(at: tuple[slice, ...], axis: int) -> tuple[slice, ...]:
+    """Return where a part of a plane of faces is in an array of the plane alone."""
+    return tuple(slice(0, 1) if b == axis else s for b, s in enumerate(at))
+
+
 def _inflow_of_parts(
-    grid: MacGrid, density: float, velocity: Faces, pressure: np.ndarray, weight: Weight | None, extras: Extras,
-    further: np.ndarray,
+    grid: MacGrid, density: float, velocity: Faces, pressure: np.ndarray, weight: Weight | None, pressed: OpenSides,
+    extras: Extras, further: np.ndarray,
 ) -> float:  # fmt: skip
     """Return what divided faces of open sides let in, and those with a given flow beyond what whole ones would, W."""
     area = np.array([grid.face_area(a) for a in range(grid.dim)])
@@ -142,16 +157,16 @@ def _inflow_of_parts(
         face, upper = np.array(np.unravel_index(extras.face[row], grid.shape(a))), extras.above[row] < 0
         v = velocity.parts[extras.row[row]]
         flow = np.where(upper, -v, v) * extras.openness[row] * area[a]
-        rest = np.zeros(len(row))
+        p = pressed.on_links(a, upper, tuple(face), extras.row[row], v)
         if weight is not None:
-            rest = weight.on([line.reshape(-1)[i] for line, i in zip(grid.lines(a), face, strict=True)])
+            p = p - weight.on([line.reshape(-1)[i] for line, i in zip(grid.lines(a), face, strict=True)])
         along = np.zeros(len(row))
         cell = face - upper * (np.arange(3) == a)[:, None]
         for b in range(grid.dim):
             if b != a:
                 above = cell + (np.arange(3) == b)[:, None]
                 along += 0.5 * (velocity[b][tuple(cell)] ** 2 + velocity[b][tuple(above)] ** 2)
-        total += float(flow @ (0.5 * density * (v**2 + along) - rest))
+        total += float(flow @ (p + 0.5 * density * (v**2 + along)))
     return total
 
 

@@ -12,6 +12,7 @@ from petfsi.fields.base import PressureFluid
 from petfsi.fields.mac import kinds, pressure
 from petfsi.fields.mac.extras import Extras
 from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.open_sides import OpenSides
 from petfsi.fields.mac.parts import Parts
 from petfsi.fields.mac.regions import Regions, find_regions
 from petfsi.fields.mac.sides import Surroundings, periodic_axes
@@ -86,7 +87,8 @@ class CoveredGrid(PressureFluid):
         self.grid = grid = MacGrid(comm, fluid.origin, fluid.size, fluid.cells, periodic)
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
         self.cell_volume, self.n_cells = grid.cell_volume, grid.layout.n_local
-        self.surroundings = Surroundings(grid, fluid.sides)
+        self.surroundings = Surroundings(grid, fluid)
+        self.open_sides = OpenSides(grid, fluid.density, fluid.sides)
         self._cutter = self._make_cutter() if scene.transfer == "cutcell" else None
         if self._cutter is None:
             for name, obstacle in scene.obstacles.items():
@@ -308,11 +310,11 @@ class CoveredGrid(PressureFluid):
         grid, pattern = self.grid, self._pattern
         c = factor / self.density * grid.cell_volume / grid.dx**2
         values = np.zeros(len(pattern.indices))
-        arrays = (*three(self.face_kind), *three(self.openness))
+        arrays = (*three(self.face_kind), *three(self.open_sides.conducting(self.openness)))
         pressure.laplacian(self._active, *arrays, self._part(None), pattern.slot, c, values)
         rows = pattern.indptr, pattern.indices, values
         if self.extras is not None:
-            rows = self.extras.block(pattern, values, self.layout, self.index, grid, c)
+            rows = self.extras.block(pattern, values, self.layout, self.index, grid, c, self.open_sides.link_yields)
         set_csr(self.fluxes, *rows, new_pattern=self._new_pattern)
         self.pattern_version += self._new_pattern
         self._new_pattern = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -12,8 +12,9 @@ from petfsi.fields.mac import kinds
 from petfsi.fields.mac.cut import Links, Walls, Wet, first_moments, links_of, patch_slots, walls_of
 from petfsi.fields.mac.extras import Extras, Inlets
 from petfsi.fields.mac.grid import MacGrid, three
+from petfsi.fields.mac.jet_cuts import jet_openings
 from petfsi.fields.mac.parts import Parts, global_index, owned
-from petfsi.fields.mac.sides import Surroundings
+from petfsi.fields.mac.sides import Jet, Surroundings
 from petfsi.fields.mac.slivers import Slivers, slivers_of
 from petfsi.geometry.clipping import CutCells, Lattice, cut
 from petfsi.geometry.obstacles import ObstacleSurfaces
@@ -148,7 +149,11 @@ class CutGrid:
         self._part(volume, None)[...] = found.volume
         grid.exchange_cells(volume)
         cell_kind, face_kind = self._kinds(openness, split)
-        layout, index, extras, parts, numbers = self._number(found, links, every.where(shut))
+        through = every.where(shut)
+        if any(jet.divides for jet in self.surroundings.jets):
+            walled = surface[1][together(seams, still.seams, n_points, len(facets)).walls]
+            through = replace(through, openness=self._to_jets(found, walled, through))
+        layout, index, extras, parts, numbers = self._number(found, links, through)
         active = cell_kind.reshape(-1)[self._flat] == kinds.FLUID
         solved = np.concatenate((self._own & active, self._own[found.extra_cell]))
         used = np.flatnonzero(solved[walls.slot])
@@ -175,6 +180,22 @@ class CutGrid:
             found.points[:n_points],
             self._facing(found),
         )
+
+    def _to_jets(self, found: CutCells, facets: np.ndarray, links: Links) -> np.ndarray:
+        """Return how open links through sides are to jets, see ``jet_cuts``."""
+        return jet_openings(found, facets, self.lattice, links, self.surroundings.jets, self._box_faces)
+
+    def _box_faces(self, jet: Jet) -> np.ndarray:
+        """Return the flat indices of a jet's faces in the box; -1 beyond it."""
+        dim, faces = self.grid.dim, self._flat_faces[jet.axis]
+        local = np.ravel_multi_index(jet.faces, self.grid.shape(jet.axis))
+        place = np.array(jet.faces[:dim]) - np.array([s.start for s in self._box[:dim]])[:, None]
+        shape = np.array(self.shape) + (np.arange(dim) == jet.axis)
+        inside = np.all((place >= 0) & (place < shape[:, None]), axis=0)
+        flat = np.full(len(local), -1, dtype=np.int64)
+        flat[inside] = np.ravel_multi_index(tuple(place[:, inside]), tuple(shape))
+        assert np.array_equal(faces[flat[inside]], local[inside])
+        return flat
 
     def _facing(self, found: CutCells) -> list[np.ndarray]:
         """Return where the walls of each cell face. Collective."""

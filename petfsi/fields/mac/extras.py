@@ -95,8 +95,9 @@ class Extras:
     # ---- the system -----------------------------------------------------------------------------------------
 
     def block(
-        self, pattern: Pattern, values: np.ndarray, layout: Layout, index: np.ndarray, grid: MacGrid, c: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, pattern: Pattern, values: np.ndarray, layout: Layout, index: np.ndarray, grid: MacGrid, c: np.ndarray,
+        yields: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Return this rank's rows of L: those of the grid, given by their values, and what links add.
 
         Parameters
@@ -108,6 +109,8 @@ class Extras:
         grid : MacGrid
         c : ndarray, shape (dim,)
             dt/rho * area / dx per axis.
+        yields : ndarray
+            By what part of that all links yield to a push, see ``open_sides``; empty if all do by all of it.
 
         Returns
         -------
@@ -128,7 +131,7 @@ class Extras:
         indptr = np.concatenate((pattern.indptr, np.full(n_rows - n_cells, pattern.indptr[-1])))
         shape = (n_rows, layout.n_global)
         rows = csr_matrix((values, columns, indptr), shape=shape)
-        weight = c[self.axis] * np.maximum(self.openness, LEAST_OPEN)
+        weight = c[self.axis] * np.maximum(self.openness, LEAST_OPEN) * self._of(yields)
         gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
         i, j, v = [], [], []
         ends = ((self.below, self.above, self.mine_below), (self.above, self.below, self.mine_above))
@@ -173,7 +176,7 @@ class Extras:
 
     def project(
         self, star: np.ndarray, p: np.ndarray, start: int, pressure: np.ndarray, index: np.ndarray,
-        factor: np.ndarray, comm: MPI.Comm,
+        factor: np.ndarray, comm: MPI.Comm, yields: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
         """Return the velocity of all links, right where the face is this rank's own. Collective.
 
@@ -187,6 +190,8 @@ class Extras:
             Cell arrays, ghosts valid: pressure, and the unknowns' numbers.
         factor : ndarray, shape (dim,)
             dt / (rho dx) per axis.
+        yields : ndarray
+            As for ``block``.
         """
         parts = comm.allgather((start, p))
         numbers = np.concatenate([s + np.arange(len(q)) for s, q in parts])
@@ -206,5 +211,9 @@ class Extras:
             ends.append(value)
         gain = np.where((self.below < 0) | (self.above < 0), 2.0, 1.0)
         out = star.copy()
-        out[self.row] -= gain * factor[self.axis] * (ends[1] - ends[0])
+        out[self.row] -= self._of(yields) * gain * factor[self.axis] * (ends[1] - ends[0])
         return out
+
+    def _of(self, yields: np.ndarray) -> np.ndarray | float:
+        """Return by what part of a push each link yields."""
+        return yields[self.row] if len(yields) else 1.0

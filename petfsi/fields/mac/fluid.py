@@ -25,6 +25,7 @@ from petfsi.ranks import agreed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression, evaluate_at
 from petfsi.scene.schema import Scene
+from petfsi.scene.side_notes import side_notes
 from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class MacFluid(CoveredGrid):
         self._extra_pressure = np.zeros(0)
         self._other_pressure: np.ndarray | None = None
         self._forces: budget.Forces | None = None
+        self._weighed = True  # no step has pushed anything yet
         self._bands = [Band(grid, axis) for axis in self._axes]
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
@@ -103,6 +105,7 @@ class MacFluid(CoveredGrid):
             self.smoke[self.cell_kind != kinds.FLUID] = 0.0
             self._complete_cells(self.smoke)
         self._transport.carried = self._extend(self.velocity)
+        self.velocity_star = each(np.copy, self.velocity)
         if self.sheets is not None:
             whole = self._sheets_of(Parts.none())
             self._go_on(Lineage(self.grid, whole, self.sheets, self.face_kind))
@@ -147,6 +150,8 @@ class MacFluid(CoveredGrid):
     def _divide(self, parts: Parts, old_kind: list[np.ndarray], other: np.ndarray) -> None:
         """Let divided faces and cells go on with what those had that they come from. Collective."""
         old, grid = self.sheets, self.grid
+        if self.surroundings.has_jets:  # what is open of a face may be so to a jet or not
+            self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         self.sheets = self._sheets_of(parts)
         self._transport.advection.sheets = self.sheets
         if old is None:
@@ -183,8 +188,9 @@ class MacFluid(CoveredGrid):
 
     def _sheets_of(self, parts: Parts) -> Sheets:
         assert self.narrow is not None
-        behind = self.surroundings.behind_jets
-        return Sheets(self.grid, parts, self.face_kind, self.narrow, self.cell_kind, behind)
+        around = self.surroundings
+        narrow = around.not_read(self.narrow)
+        return Sheets(self.grid, parts, self.face_kind, narrow, self.cell_kind, around.behind_jets)
 
     def _go_on(self, lineage: Lineage) -> None:
         """Take over velocities and smoke of the former parts. Collective."""
@@ -221,15 +227,18 @@ class MacFluid(CoveredGrid):
         self._remember("smoke", "_extra_pressure", "velocity", "smoke_parts", "sheets")
         transport = self._transport
         transport.remember()
-        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         moment, smoke, further = transport.moment(dt), self.smoke, self.smoke_parts
+        self.surroundings.evaluate(time + moment)
+        if self.surroundings.carries_along:
+            for faces in transport.read():
+                self.surroundings.fill_along(faces)
+        transport.predict(self._moved, dt, self.velocity_star, self._extend)
         if self.smoke is not None and self._smoke_band is not None:
             old, parts = self.smoke, self.smoke_parts
             self.smoke, self.smoke_parts = transport.carry_smoke(old, parts, self._smoke_band.layer != FAR, dt)
             self._complete_cells(self.smoke)
             smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
             further = self.smoke_parts if moment == dt else parts + moment / dt * (self.smoke_parts - parts)
-        self.surroundings.evaluate(time + moment)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         self._add_forces(time + moment, transport.factor(dt), smoke, further)
 
@@ -244,6 +253,8 @@ class MacFluid(CoveredGrid):
         heavy = [self.weight is None or p for p in self.grid.periodic]
         self._forces = forces = budget.Forces.of(gravity, heavy, buoyancy, smoke, link_smoke)
         before = None if local is None else local.at_faces(self.velocity_star)
+        self.open_sides.evaluate(time, gravity)
+        self.open_sides.push(self.velocity_star, self.face_kind, duration)
         if self.weight is not None:
             self.weight.at(time)
             self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
@@ -266,6 +277,7 @@ class MacFluid(CoveredGrid):
                 self._part(axis),
             )
             self.grid.exchange_faces(axis, star, width=1)
+        self._weighed = not self.open_sides.total
 
     def assemble(self, time: float, dt: float) -> None:
         """Refresh L if the geometry or the step changed, the right-hand side and the scales. Collective."""
@@ -273,11 +285,29 @@ class MacFluid(CoveredGrid):
         dx = grid.cell_volume ** (1.0 / self.dim)
         self.row_scale, self.col_scale = 1.0 / dx ** (self.dim - 1), self.density * dx / dt
         factor = self.factor(dt)
+        if not self._weighed:  # the cells are cut as this step sees them by now
+            table = None if self.sheets is None else self.sheets.table
+            carried = self._transport.carried
+            self.open_sides.weigh(carried, self.velocity_star, self.face_kind, factor, table)
+            self._weighed, self._assembled_for = True, None
         if self._assembled_for != (self.geometry_version, factor):
             self._assemble_block(factor)
         self.rhs[:] = -self._outflow(self.velocity_star)
         if self.source is not None:
             self.rhs += self.source
+
+    def net_outflow(self) -> np.ndarray:
+        """Return by unknown what leaves it at the present velocity but through solids' walls."""
+        return self._outflow(self.velocity)
+
+    def push(self, x: np.ndarray, dt: float) -> None:
+        """Change the present velocity as the pressure x would in a first step of dt. Collective."""
+        p = self.grid.zeros_cells()
+        self.grid.from_vec(x[: self.grid.layout.n_local], p)
+        self.grid.exchange_cells(p)
+        self.velocity_star = each(np.copy, self.velocity)
+        self.velocity = self._projected(p, x, self._transport.factor(dt))
+        self._transport.carried = self._extend(self.velocity)
 
     def inflow(self) -> np.ndarray | None:
         """Return by unknown what jets let in, m^3/s (m^2/s in 2D); None if there are none. Not collective."""
@@ -332,32 +362,12 @@ class MacFluid(CoveredGrid):
 
         Smoke has moved in ``predict`` already; here cells that are fluid only now get the mean of their neighbours.
         """
-        grid, factor = self.grid, self._transport.factor(dt)
-        n_cells = grid.layout.n_local
-        grid.from_vec(x[:n_cells], self.pressure)
+        grid = self.grid
+        grid.from_vec(x[: grid.layout.n_local], self.pressure)
         grid.exchange_cells(self.pressure)
-        solved = Faces(np.zeros_like(v) for v in self.velocity)
-        for axis in self._axes:
-            pressure.project(
-                self.velocity_star[axis],
-                self.pressure,
-                self.boundary_velocity[axis],
-                self.face_kind[axis],
-                kinds.STEP[axis],
-                factor / (self.density * grid.dx[axis]),
-                self._part(axis),
-                solved[axis],
-            )
+        solved = self._projected(self.pressure, x, self._transport.factor(dt))
         if self.extras is not None:
-            self._extra_pressure = x[n_cells:].copy()
-            assert self.sheets is not None
-            local, extras = self.sheets.local, self.extras
-            parts = extras.project(
-                self.velocity_star.parts, self._extra_pressure, self.layout.start + n_cells, self.pressure,
-                self.index, factor / (self.density * grid.dx), self.comm,
-            )  # fmt: skip
-            solved.parts = local.gathered(parts, extras.row[extras.owned])
-            local.mean_into(solved, solved.parts)
+            self._extra_pressure = x[grid.layout.n_local :].copy()
         if self.weight is not None:
             rest = self.weight.pressure()
             self.pressure += np.where(self._active, rest, 0.0)
@@ -368,6 +378,44 @@ class MacFluid(CoveredGrid):
         self.velocity = self._transport.accept(solved, self.face_kind, dt, self._extend)
         if self.smoke is not None:
             self._complete_cells(self.smoke)
+
+    def _projected(self, p: np.ndarray, x: np.ndarray, factor: float) -> Faces:
+        """Return v_w = v* - (factor/rho) G p on owned faces, see ``transport``. Collective.
+
+        Parameters
+        ----------
+        p : ndarray
+            Pressure, Pa, a cell array with its ghosts.
+        x : ndarray
+            The same by unknown, with further pieces' at the end.
+        factor : float
+            s.
+        """
+        grid, star = self.grid, self.velocity_star
+        solved = Faces(np.zeros_like(v) for v in self.velocity)
+        for axis in self._axes:
+            pressure.project(
+                star[axis],
+                p,
+                self.boundary_velocity[axis],
+                self.face_kind[axis],
+                kinds.STEP[axis],
+                factor / (self.density * grid.dx[axis]),
+                self._part(axis),
+                solved[axis],
+            )
+        if self.open_sides.total:
+            self.open_sides.relax(solved, star, self.face_kind)
+        if self.extras is not None:
+            assert self.sheets is not None
+            local, extras, n_cells = self.sheets.local, self.extras, grid.layout.n_local
+            parts = extras.project(
+                star.parts, x[n_cells:], self.layout.start + n_cells, p, self.index,
+                factor / (self.density * grid.dx), self.comm, self.open_sides.link_yields,
+            )  # fmt: skip
+            solved.parts = local.gathered(parts, extras.row[extras.owned])
+            local.mean_into(solved, solved.parts)
+        return solved
 
     def _remember_extras(self) -> None:
         """Keep the pressure of the second piece of split cells where the next step's cells can find it."""
@@ -393,12 +441,13 @@ class MacFluid(CoveredGrid):
             self.grid.fill_sides(known, axis)
             extended.append(known)
         new = Faces(extended, faces.parts)
-        if self.sheets is None or not self.sheets.anywhere:
-            return new
-        # a band takes both sides; and what is narrow now may be read as it is in the next step
-        new = self.sheets.renew_faces(new, self.sheets.slim)
-        for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
-            np.copyto(v, known, where=slit & slim)
+        if self.sheets is not None and self.sheets.anywhere:
+            # a band takes both sides; and what is narrow now may be read as it is in the next step
+            new = self.sheets.renew_faces(new, self.sheets.slim)
+            for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
+                np.copyto(v, known, where=slit & slim)
+        if self.surroundings.carries_along:
+            self.surroundings.fill_along(new)
         return new
 
     def _complete_cells(self, smoke: np.ndarray) -> None:
@@ -408,6 +457,11 @@ class MacFluid(CoveredGrid):
         self.surroundings.fill_smoke(smoke)
 
     # ---- observation ------------------------------------------------------------------------------------------
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of the sides."""
+        return side_notes(self.scene)
 
     def cfl(self, dt: float) -> float:
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
@@ -463,8 +517,8 @@ class MacFluid(CoveredGrid):
             self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
         return -inflow[unknowns]
 
-    def work(self, dt: float) -> Work:
-        """Return this rank's share of what was done in the step last accepted, see ``budget``."""
+    def power(self) -> Work:
+        """Return this rank's share of the power of gravity and of what comes through sides, see ``budget``."""
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
         gravity = 0.0
         if self._forces is not None:
@@ -473,12 +527,12 @@ class MacFluid(CoveredGrid):
                 local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
                 now = None if local is None else local.at_cells(forces.smoke, self.smoke_parts)
                 forces = replace(forces, link_smoke=now)
-            gravity = dt * budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
+            gravity = budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
         into = budget.inflow(
-            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.extras,
-            self._extra_pressure,
+            self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.surroundings,
+            self.open_sides, self.extras, self._extra_pressure,
         )  # fmt: skip
-        return Work(gravity=gravity, boundary=dt * into)
+        return Work(gravity=gravity, boundary=into)
 
     def cells_slab(self, values: np.ndarray) -> Slab:
         """Return a value per cell, in the DMDA's order, as a piece of a global array."""

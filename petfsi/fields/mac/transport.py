@@ -83,6 +83,10 @@ class Transport:
         path = self._whole or self.advection.path(self.half_way(dt), dt)
         return self.advection.carry_smoke(smoke, extras, path, moved)
 
+    def read(self) -> list[Faces]:
+        """Return all that the coming step reads."""
+        return [self.carried, *self.past.values()]
+
     def remember(self) -> None:
         """Keep what ``rewind`` puts back."""
         self._before = self.carried, dict(self.past)
@@ -218,6 +222,10 @@ class MidpointTransport(Transport):
             read = np.where(kept[axis], own[axis], v)
             self.advection.keep_own(own[axis], read, path, axis, star[axis])
         self._start = each(np.copy, star)
+
+    def read(self) -> list[Faces]:
+        """Return all that the coming step reads."""
+        return super().read() if self._read is None else [*super().read(), self._read]
 
     def change(self, change: Callable[[Faces], Faces]) -> None:
         """Replace all that the next step reads, and what this one has begun with."""

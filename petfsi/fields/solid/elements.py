@@ -245,41 +245,29 @@ class Elements:
             kinetic += 0.5 * batch.mass_product(volume, u, u)
         return kinetic, elastic
 
-    def powers(
-        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
-    ) -> tuple[float, float]:
-        """Return two powers of a step's forces, over the counted elements, W. Not collective.
-
-        The damping's  w . C w,  and that of the residual of A w - b without loads,
-
-            g . (M (a w - V) + C w + K(d) + K'(d) (s + k w)) .
+    def damping(self, d: np.ndarray, w: np.ndarray, counted: np.ndarray) -> float:
+        """Return what damping takes from the counted elements, w . (a0 M + a1 K'(d)) w, W. Not collective.
 
         Parameters
         ----------
-        at : State
-            d, V, s at all local nodes.
-        a, k : float
-            1/s, s.
-        w, g : ndarray, shape (n, dim)
-            The solution, and any other velocity, m/s.
+        d, w : ndarray, shape (n, dim)
+            Where the tangent is taken, m, and velocities, m/s, at all local nodes.
         counted : ndarray of bool, shape (n_elements,)
             Group after group.
         """
-        damping = power = 0.0
+        total = 0.0
         for batch, volume in self._counted(counted):
             a0, a1 = self.bodies.mass_damping[batch.body], self.bodies.stiffness_damping[batch.body]
-            damping += a0 * batch.mass_product(volume, w, w)
-            power += batch.mass_product(volume, g, (a + a0) * w - at.inertia)
-            for part in batch.parts():
-                _, P, C = batch.respond(at.displacement, part)
+            if a0:
+                total += a0 * batch.mass_product(volume, w, w)
+            for part in batch.parts() if a1 else ():
+                C = batch.respond(d, part)[2]
                 weights = np.outer(volume[part], batch.rule.weights).ravel()
-                rate, slope = batch.gradients(w, part), batch.gradients(g, part)
-                stress = np.zeros_like(P)
+                rate = batch.gradients(w, part)
+                stress = np.zeros_like(rate)
                 batch.loops.contract(C, rate, stress)
-                damping += a1 * float(weights @ (stress * rate).sum(axis=(1, 2)))
-                batch.loops.contract(C, batch.gradients(at.shift, part), P)
-                power += float(weights @ ((P + (k + a1) * stress) * slope).sum(axis=(1, 2)))
-        return damping, power
+                total += a1 * float(weights @ (stress * rate).sum(axis=(1, 2)))
+        return total
 
     def smallest_ratios(self, d: np.ndarray) -> np.ndarray:
         """Return the smallest det F of each body at this rank's quadrature points, infinite where it has none."""

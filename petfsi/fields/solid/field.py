@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.base import Forces, Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
@@ -84,6 +84,7 @@ class NodalSolid(SolidField):
         self.extent = float(np.ptp(mesh.points, axis=0).max())
         self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
         self.explicit = self.diagonal = self._integrator.explicit
+        self._has_inertia = bool(np.isfinite(self._integrator.factor(1.0, 0.0)))
         if self.explicit:
             solids = {name: solid.model_copy(update={"mass": "lumped"}) for name, solid in solids.items()}
         self._node_body = np.empty(len(mesh.points), dtype=np.int32)
@@ -135,8 +136,7 @@ class NodalSolid(SolidField):
         self._turning: Turning | None = None
         self._shrinkage: Shrinkage | None = None
         parts, body, modulus = self._turning_parts()
-        inertia = np.isfinite(self._integrator.factor(1.0, 0.0))
-        if self.explicit or not inertia or not self.comm.allreduce(len(parts)):
+        if self.explicit or not self._has_inertia or not self.comm.allreduce(len(parts)):
             return
         mine = self._mesh.natural[: self._mesh.n_owned]
         mass = np.stack([self._uniform[a][:, a] for a in range(self.dim)], axis=1)
@@ -177,11 +177,18 @@ class NodalSolid(SolidField):
         here = (held >= self.layout.start) & (held < self.layout.end)
         local = self.width * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.width)
         self._is_held = np.isin(local, held)
-        self._loses = self._supports.move or bool(np.any(self._damping))
-        self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
         placed = self._supports.placed
-        here = here[placed]
-        self.displacement.reshape(-1)[held[placed][here] - self.layout.start] = self._supports.displacements(0.0)[here]
+        self._damps = bool(np.any(self._damping))
+        self._reacts = self._supports.move
+        if self._has_inertia:
+            self.velocity.reshape(-1)[held[here] - self.layout.start] = self._prescribed[here]
+            here = here[placed]
+            where = held[placed][here] - self.layout.start
+            self.displacement.reshape(-1)[where] = self._supports.displacements(0.0)[here]
+        else:  # the first step is the way there from the initial displacement, and has its work
+            self._reacts |= len(placed) > 0
+        acts = {"gravity": bool(self._gravity), "loads": self._loads is not None, "boundary": self._reacts}
+        self.acting = tuple(name for name, does in acts.items() if does)
         self._measured = self.displacement.copy()
 
     @cached_property
@@ -294,7 +301,7 @@ class NodalSolid(SolidField):
         self._loaded = stage, state, self._add_weight(time, dt)
         if self._loads is not None:
             self._loads.assemble(time + self._integrator.moment(dt), state, 0.0, None, b)
-        if self._loses:
+        if self._reacts:
             self._pull = b.copy()
         self._prescribe(stage, time, dt)
         lumped.prescribe(self.rhs, stage.a, mean, self._prescribed)
@@ -342,6 +349,10 @@ class NodalSolid(SolidField):
             return False
         self._stage = relinearised(stage, x.reshape(-1, self.width))
         return True
+
+    def push(self, change: np.ndarray) -> None:
+        """Change the present velocities by this much."""
+        self.velocity = self.velocity + change.reshape(-1, self.width)
 
     def rewind(self) -> None:
         """Forget the step begun."""
@@ -495,6 +506,11 @@ class NodalSolid(SolidField):
             there = self.comm, self.layout, self._integrator, self._motion()
             self._prescribed[placed] = self._supports.reaching(*there, stage, time, dt)
 
+    def _still_nodes(self) -> np.ndarray:
+        """Return which nodes, in the scene's own order, supports hold where they are, along all axes."""
+        axes = self.width * self._number.astype(np.int64)[:, None] + np.arange(self.dim)
+        return np.isin(axes, self._supports.still).all(axis=1)
+
     def along_axes(self, x: np.ndarray) -> np.ndarray:
         """Return the velocities along the axes, shape (n_owned, dim); a beam's rotations are none."""
         return x.reshape(-1, self.width)[:, : self.dim]
@@ -518,33 +534,66 @@ class NodalSolid(SolidField):
         kinetic, elastic = self._elements.energies(d, u, self._mesh.counted)
         return Stock(self._uniform.reshape(self.dim, -1) @ self.velocity.ravel(), kinetic, elastic)
 
-    def work(self, dt: float) -> Work:
-        """Return this rank's share of what was done in the step last accepted.
+    def forces(self) -> Forces:
+        """Return gravity, loads and reactions of the step last accepted, where the integrator took them. Collective.
 
-        Gravity and loads act along the way that nodes moved; damping (w . C w) and supports, with the reaction that is
-        the residual of their equations without other fields' forces, act at w for dt.
+        A reaction is the residual of a held unknown's equation, without other fields' forces.
         """
-        if self._loaded is None:
-            return Work()
+        assert self._loaded is not None  # a step was assembled
         stage, state, gravity = self._loaded
-        weight = (gravity @ self._uniform.reshape(self.dim, -1)).reshape(self.velocity.shape)
-        fallen, loaded = float(np.vdot(weight, self.moved)), 0.0
-        if not self._loses and self._loads is None:
-            return Work(gravity=fallen)
-        w = self._with_shared(self._integrator.solved(self._motion()))
+        shares = self._loads is not None or self._reacts
+        w = self._with_shared(self._integrator.solved(self._motion())) if shares else np.zeros(0)
+        found: Forces = {}
+        if self._gravity:
+            found["gravity"] = gravity @ self._uniform.reshape(self.dim, -1)
         if self._loads is not None:
-            load = self._loads.felt(w)
-            loaded, weight = float(np.vdot(load, self.moved)), weight + load
-        if not self._loses:
-            return Work(gravity=fallen, loads=loaded)
-        g = np.where(self._is_held, w, 0.0)
-        if self._lumped is not None:
-            lost, _ = self._elements.powers(state, 0.0, 0.0, w, np.zeros_like(w), self._mesh.counted)
-            done = np.vdot(g[: self._mesh.n_owned], self._lumped.inertia(stage.a, w[: self._mesh.n_owned]) - self._pull)
-            return Work(fallen, dt * lost, dt * float(done), loaded)
-        damping, power = self._elements.powers(state, stage.a, stage.k, w, g, self._mesh.counted)
-        power -= float(np.vdot(weight, g[: self._mesh.n_owned]))
-        return Work(fallen, dt * damping, dt * power, loaded)
+            found["loads"] = self._loads.felt(w).ravel()
+        if self._reacts and self._lumped is not None:
+            n = self._mesh.n_owned
+            pulled = self._lumped.inertia(stage.a, w[:n]) - self._pull
+            found["boundary"] = np.where(self._is_held[:n], pulled, 0.0).ravel()
+        elif self._reacts:
+            a0, a1 = self._damping[self._node_body[self._mesh.natural]].T[:, :, None]
+            # the residual as what forces give for what is left of the step's equation
+            inertia, shift = state.inertia - (stage.a + a0) * w, state.shift + (stage.k + a1) * w
+            found["boundary"] = self._reaction(State(state.displacement, inertia, shift), found)
+        return found
+
+    def starting_forces(self) -> Forces:
+        """Return the same of the present state at time zero, reactions in statics alone: it is at rest. Collective."""
+        d = self._with_shared(self.displacement)
+        found: Forces = {}
+        if self._gravity:
+            gravity = np.array([float(g(t=0.0)) for g in self._gravity])
+            found["gravity"] = gravity @ self._uniform.reshape(self.dim, -1)
+        if self._loads is not None:
+            found["loads"] = self._loads.start(d).ravel()
+        if self._reacts and not self._has_inertia:
+            rest = np.zeros_like(d)
+            found["boundary"] = self._reaction(State(d, rest, rest), found)
+        return found
+
+    def _reaction(self, state: State, given: Forces) -> np.ndarray:
+        """Return what holds held unknowns against a state's forces and what else is given, zero at free ones, flat."""
+        pulled = np.empty_like(self.velocity)
+        self._elements.forces(state, pulled)
+        total = pulled.ravel() + sum(given.values())
+        return np.where(self._is_held[: self._mesh.n_owned].ravel(), -total, 0.0)
+
+    def work(self, dt: float) -> Work:
+        """Return what damping took in an explicit step, whose w is the velocity in its middle. Collective."""
+        return Work(damping=dt * self._lost()) if self.explicit else Work()
+
+    def power(self) -> Work:
+        """Return what damping took where the integrator took the forces, W. Collective."""
+        return Work() if self.explicit else Work(damping=self._lost())
+
+    def _lost(self) -> float:
+        """Return this rank's share of w . C w of the step last accepted, W. Collective."""
+        if self._loaded is None or not self._damps:
+            return 0.0
+        w = self._with_shared(self._integrator.solved(self._motion()))
+        return self._elements.damping(self._loaded[1].displacement, w, self._mesh.counted)
 
     def energies(self) -> dict[str, float]:
         """Return the kinetic and elastic energy of all bodies, J (per metre in 2D). Collective."""
@@ -567,10 +616,9 @@ class NodalSolid(SolidField):
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
-        begin, end, _ = self._slab
 
         def nodes(name: str) -> np.ndarray:
-            return self._from_natural(np.asarray(read(name, (begin, 0), (end - begin, self.width)), dtype=float))
+            return self.read_stored(read, name).reshape(-1, self.width)
 
         self.displacement, self.velocity = nodes("displacement"), nodes("velocity")
         self._past = tuple(nodes(name) for name in self._integrator.past)
@@ -579,6 +627,15 @@ class NodalSolid(SolidField):
         if self._lumped is not None:
             self._measured = nodes("displacement_measured")
         self._stage = self._geometry = None
+
+    def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:
+        """Return a value per unknown on this rank in the mesh's own order. Collective."""
+        return {name: self._natural_rows(x.reshape(-1, self.width))}
+
+    def read_stored(self, read: Reader, name: str) -> np.ndarray:
+        """Return what ``stored`` gave, flat. Collective."""
+        begin, end, _ = self._slab
+        return self._from_natural(np.asarray(read(name, (begin, 0), (end - begin, self.width)), dtype=float)).ravel()
 
     def _present(self) -> dict[str, Slab]:
         return {"displacement": self._natural_rows(self.displacement), "velocity": self._natural_rows(self.velocity)}

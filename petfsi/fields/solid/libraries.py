@@ -38,10 +38,8 @@ class ElementLibrary(Protocol):
         """Return the kinetic and elastic energy of the counted elements, J. Not collective."""
         ...
 
-    def powers(
-        self, at: State, a: float, k: float, w: np.ndarray, g: np.ndarray, counted: np.ndarray
-    ) -> tuple[float, float]:
-        """Return what damping takes and what g does against the step's forces, W. Not collective."""
+    def damping(self, d: np.ndarray, w: np.ndarray, counted: np.ndarray) -> float:
+        """Return what damping takes, w . C w, W. Not collective."""
         ...
 
 
@@ -55,6 +53,10 @@ class LoadLibrary(Protocol):
 
     def assemble(self, time: float, at: State, k: float, values: np.ndarray | None, b: np.ndarray) -> None:
         """Add  f(d~) + f' s  to b and  -k f'  to A's values, where forces depend on d. Collective."""
+        ...
+
+    def start(self, d: np.ndarray) -> np.ndarray:
+        """Return the forces at time zero on nodes that are displaced so, at the owned ones, N. Collective."""
         ...
 
     def felt(self, w: np.ndarray) -> np.ndarray:

@@ -82,11 +82,11 @@ class SimplexSolid(NodalSolid):
         hollow = np.array([solid.interior == "void" for solid in solids.values()])
         nodes, facets = np.unique(facets, return_inverse=True)
         facets = facets.reshape(-1, self.dim)
+        self._surface_nodes = nodes
         if curved is not None:
             curved = curved._replace(nodes=np.searchsorted(nodes, curved.nodes))
         unknowns = (self.dim * number[nodes].astype(np.int64)[:, None] + np.arange(self.dim)).ravel()
         fixed = np.isin(unknowns, self._supports.unknowns)
-        self._surface_body = node_body[nodes]
         # the surface's points are gathered rank after rank; this is where each belongs
         self._gathered = np.argsort(number[nodes])
         self._wet = number[nodes][self._gathered] - self._mesh.nodes.start
@@ -135,6 +135,14 @@ class SimplexSolid(NodalSolid):
         """Return the boundary of all bodies, the same on every rank."""
         return self._surface
 
+    def surface_bodies(self) -> np.ndarray:
+        """Return the body of each of its points."""
+        return self._node_body[self._surface_nodes]
+
+    def surface_rooted(self) -> np.ndarray:
+        """Return which of its points supports hold where they are, along all axes."""
+        return self._still_nodes()[self._surface_nodes]
+
     def surface_positions(self) -> np.ndarray:
         """Return the positions of the surface's points, shape (n_points, dim). Collective.
 
@@ -151,10 +159,6 @@ class SimplexSolid(NodalSolid):
         """Return where the surface's points are if this rank's nodes on it are at ``wet``. Collective."""
         nodes = self._gather_surface(wet)
         return nodes if self._surface.curved is None else self._surface.curved.vertices(nodes)
-
-    def surface_bodies(self) -> np.ndarray:
-        """Return which body each point of the surface belongs to."""
-        return self._surface_body
 
     def surface_present(self) -> np.ndarray:
         """Return the present positions of its points, shape (n_points, dim). Collective."""

@@ -1,10 +1,9 @@
-"""Bodies in a fluid of particles: what they take the place of, hide and throw back, and where they sink."""
+"""Bodies in a fluid of particles: what they take the place of, hide and throw back."""
 
 from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
-from scipy.spatial import cKDTree
 
 from petfsi.errors import SolveError
 from petfsi.fields.sph.cells import Pairs
@@ -25,8 +24,6 @@ CLEARANCE = 0.25
 #: Bodies thinner than so many spacings for the most part hide one side from the other, and have two sets of wall
 #: particles; if so large a part of the others' surface is as thin, that is told.
 THIN, PARTLY = 1.75, 0.3
-#: A point nearer than so many spacings to a wall particle that is a spacing or more inside is there, too.
-SUNK = 0.6
 
 
 class Bodies:
@@ -55,7 +52,7 @@ class Bodies:
 
     def __init__(self, comm: MPI.Comm, room: Room, walls: Dummies, no_slip: bool) -> None:
         self.comm, self.room, self._no_slip = comm, room, no_slip
-        self._walls, self._deep = walls.x, cKDTree(walls.x[walls.depth > room.spacing])
+        self._walls = walls.x
         self.skin: Skin | None = None
         self._sight: Sight | None = None
         self.notes: list[str] = []
@@ -79,7 +76,6 @@ class Bodies:
         if np.any(thin):
             reach = room.reach + room.near
             self._sight = Sight(facets, thin, reach, wet_on_both_sides(points, facets, reach), room.grid)
-        self._rooted = self._sunk()
         return self.skin
 
     def clear(self, swarm: Swarm, points: np.ndarray, facets: np.ndarray) -> None:
@@ -135,28 +131,3 @@ class Bodies:
         swarm["x"][found.rows], swarm["v"][found.rows] = found.x, found.v
         self.skin.knock(found.facets, found.x, lost)
         self.n_put_back += number
-
-    # ---- where they sink --------------------------------------------------------------------------------------------
-
-    def _sunk(self) -> np.ndarray:
-        """Return which points of the surface are a spacing or more inside of walls, or beyond."""
-        assert self.skin is not None
-        x, room = self.skin.points, self.room
-        return room.behind_wall(x, room.spacing) | (self._deep.query(x)[0] < SUNK * room.spacing)
-
-    def refuse_sunk(self) -> None:
-        """See that no solid has gone into a wall. Not collective; all ranks know the same.
-
-        Raises
-        ------
-        SolveError
-        """
-        if self.skin is None:
-            return
-        sunk = np.flatnonzero(self._sunk() & ~self._rooted)
-        if len(sunk):
-            at = ", ".join(f"{c:g}" for c in self.skin.points[sunk[0]])
-            raise SolveError(
-                f"a solid has gone into a wall: a point of it is at ({at}), a spacing or more behind a side's or an "
-                "obstacle's face; solids do not feel walls"
-            )

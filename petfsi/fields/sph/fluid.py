@@ -297,7 +297,6 @@ class SphFluid(FluidField):
             swarm.rebuild(swarm.balanced())
         except StrayError as error:
             raise SolveError(f"the particles have blown up: {error}") from None
-        self.bodies.refuse_sunk()
         swarm["anchor"][:] = swarm["x"]
         pairs = self._lists.fluid(swarm["x"], swarm.owned, swarm.first, swarm.counts, reach)
         self.pairs: Pairs = self.bodies.strike(pairs, swarm["x"])

@@ -164,7 +164,7 @@ class Loads:
         b : ndarray, shape (n_owned, dim)
         """
         if self.follow or self._dead.depends_on_place_and_time:
-            self._force = agreed(self.comm, lambda: self._forces(time, at))
+            self._force = agreed(self.comm, lambda: self._forces(time, at.displacement))
         else:
             self._force = self._dead.forces(time)
         self._k = k
@@ -177,11 +177,21 @@ class Loads:
                     tangent.add(values, -k)
         b += self._force
 
-    def _forces(self, time: float, at: State) -> np.ndarray:
+    def start(self, d: np.ndarray) -> np.ndarray:
+        """Return the forces at time zero on nodes that are displaced so, at the owned ones, N. Collective.
+
+        Parameters
+        ----------
+        d : ndarray, shape (n_nodes, dim)
+            At all local nodes, m.
+        """
+        return agreed(self.comm, lambda: self._forces(0.0, d))
+
+    def _forces(self, time: float, d: np.ndarray) -> np.ndarray:
         total = self._dead.forces(time)
         if not self.follow:
             return total
-        total, x = total.copy(), self._mesh.points + at.displacement
+        total, x = total.copy(), self._mesh.points + d
         followers: list[FollowerPressure | FollowerTraction] = [*self._pressures, *self._tractions]
         for load in followers:
             total += load.facets.gather(load.forces(x, time), len(total))

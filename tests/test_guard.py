@@ -1,0 +1,87 @@
+"""A run whose energy grows out of nothing stops by name."""
+
+from pathlib import Path
+
+import pytest
+from load_cases import COMM
+from step_cases import loaded, prepared, stored
+from test_restart import reader
+
+from petfsi.errors import SolveError
+from petfsi.plan import skipped
+from petfsi.scene.load import scene_from_dict
+
+JOBS = Path(__file__).parents[1] / "jobs"
+SPLIT = ("-options_file", "split.opts")
+
+
+def spinning(**time):
+    """A stiff disk that turns by .13 rad a step: the midpoint rule shrinks it half-way, and its energy grows."""
+    shape = {"ball": {"centre": [0.0, 0.0], "radius": 0.2, "cells": 6}}
+    solid = {"shape": shape, "density": 1000.0, "young": 1e7, "poisson": 0.3}
+    solid["initial"] = {"velocity": ["-13*y", "13*x"]}
+    steps = {"end": 1.0, "dt": 0.01, "integrator": "midpoint", "retries": 0}
+    return scene_from_dict({"dim": 2, "time": steps | time, "solids": {"disk": solid}})
+
+
+def until_it_stops(sim, most=200):
+    """Return after how many more steps a simulation stops, and why."""
+    for n in range(most):
+        try:
+            sim.advance()
+        except SolveError as error:
+            return n, str(error)
+    return most, ""
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_a_stop_says_what_has_grown_and_by_how_much():
+    with prepared(spinning(), comm=COMM) as sim:
+        first = sim.accounts.values["kinetic"]
+        n, why = until_it_stops(sim)
+        values = sim.accounts.values
+    assert 0 < n < 50
+    assert values["energy_residual"] == pytest.approx(values["kinetic"] + values["elastic"] - first, rel=1e-9)
+    assert first < values["energy_residual"] < 50 * first
+    assert why.startswith("energy has come out of nothing, most of it ")
+    assert f"was never more than {first:.3g} J." in why and "Try a smaller dt, -fsi_snes_type newtonls" in why
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_run_that_goes_on_stops_as_one_that_never_stopped():
+    """Nothing holds or gives the energy any more of which the most was held at the start: that is in the checkpoint."""
+    scene = loaded(JOBS / "column.toml", "fluid.cells=[8, 16]", "gravity=[0, 0]", "solids.layer.density=900")
+    with prepared(scene, *SPLIT, comm=COMM) as straight, prepared(scene, *SPLIT, comm=COMM) as again:
+        straight.guard.largest = 1e-3
+        straight.advance()
+        arrays = stored(straight)
+        straight.forget()
+        again.restore(straight.step, straight.time, straight.dt, lambda group: reader(arrays[group]))
+        assert again.guard.largest == 1e-3
+        assert until_it_stops(straight) == until_it_stops(again)
+
+
+def test_a_splitting_scheme_is_told_what_to_try():
+    with prepared(loaded(JOBS / "column.toml", "fluid.cells=[8, 16]"), *SPLIT) as sim:
+        n, why = until_it_stops(sim)
+    assert n < 5 and "out of nothing" in why and "try monolithic.opts" in why
+
+
+@pytest.mark.parametrize("setting", ["time.energy_limit=-1", "output.accounts=false"])
+def test_a_run_that_nothing_watches_ends_otherwise(setting):
+    scene = loaded(JOBS / "column.toml", "fluid.cells=[8, 16]", setting)
+    assert ("time.energy_limit: output.accounts is false" in skipped(scene)) == ("accounts" in setting)
+    with prepared(scene, *SPLIT) as sim:
+        n, why = until_it_stops(sim)
+    assert n > 5 and "out of nothing" not in why
+
+
+def test_water_that_rests_around_a_body_alarms_nobody():
+    """Round-off moves it, and there is nothing else to compare that with."""
+    solid = {"shape": {"ball": {"centre": [0.5, 0.5], "radius": 0.2, "cells": 8}}, "density": 1000.0, "young": 1e6}
+    fluid = {"density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [16, 16]}
+    time = {"end": 1.0, "dt": 0.01, "integrator": "midpoint"}
+    solids = {"disk": solid | {"poisson": 0.3}}
+    scene = scene_from_dict({"dim": 2, "gravity": [0.0, -9.81], "time": time, "fluid": fluid, "solids": solids})
+    with prepared(scene) as sim:
+        assert until_it_stops(sim, 10) == (10, "")
