@@ -196,6 +196,15 @@ def test_bdf2_loses_its_own_loss_under_whatever_drives_it(drive):
     assert 0.01 < taken / rows[0]["kinetic"] < 1.0
 
 
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("integrator", ["bdf2", "static"])
+def test_a_load_without_a_value_at_time_zero_is_that_of_the_first_step(integrator):
+    pull = [{"where": "right", "traction": ["5 + 0*x/t", 0.0]}]
+    got = history(bar(integrator, 10, 0.0, loads=pull), 2)
+    constant = history(bar(integrator, 10, 0.0, loads=[{"where": "right", "traction": [5.0, 0.0]}]), 2)
+    np.testing.assert_allclose(got["load_work"], constant["load_work"], rtol=1e-12)
+
+
 # ---- in a fluid ---------------------------------------------------------------------------------------------
 
 
