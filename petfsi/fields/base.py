@@ -491,7 +491,7 @@ class SolidField(Field):
 
     @abstractmethod
     def starting_forces(self) -> Forces:
-        """Return the same of the present state at time zero, reactions in statics alone: it is at rest. Collective."""
+        """Return the same of the present state at time zero, as far as it is known. Collective."""
 
     @abstractmethod
     def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:
