@@ -15,8 +15,10 @@ from petfsi.regions import ClosedRegions
 from petfsi.solve import Solver
 from petfsi.system import System
 
-#: Net outflows this many times their round-off are none.
+#: Net outflows, and forces, this many times their round-off are none.
 ROUND_OFF = 10.0
+#: This part of what leaves cells may be left where the solver stops for the round-off of forces.
+LEFT = 1e-8
 
 
 def fit_velocities(
@@ -71,7 +73,7 @@ def fit_velocities(
         fluid.rhs[:] = -outflow
     system.refresh()
     system.solution.set(0.0)
-    _solve(system, solver, regions)
+    _solve(system, solver, regions, fluid)
     changes = dict(zip((field.name for field in system.fields), system.values(), strict=True))
     if solid is not None:
         solid.push(changes[solid.name])
@@ -81,7 +83,7 @@ def fit_velocities(
     return True
 
 
-def _solve(system: System, solver: Solver, regions: ClosedRegions) -> None:
+def _solve(system: System, solver: Solver, regions: ClosedRegions, fluid: PressureFluid) -> None:
     try:
         if solver.decoupled:
             solver.reset()
@@ -93,7 +95,11 @@ def _solve(system: System, solver: Solver, regions: ClosedRegions) -> None:
         else:
             solver.solve_linear(system.rhs, system.solution)
     except SolveError as error:
-        raise SolveError(f"the velocities at t = 0 cannot be made to fit each other: {error}") from None
+        # what is left of a stiff body's large forces may be no more than their round-off
+        norms = system.update_residual()
+        forces = norms[""] <= ROUND_OFF * system.round_off()
+        if not (forces and norms[fluid.name] <= LEFT * norms["rhs"]):
+            raise SolveError(f"the velocities at t = 0 cannot be made to fit each other: {error}") from None
 
 
 @contextmanager

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from petfsi.errors import TouchError
 from petfsi.fields.base import SolidField
@@ -234,9 +236,8 @@ class Watch:
         """Note what of a body begins in another thing, or is held where it touches it."""
         a, b = self._things[one], self._things[other]
         drawn, against = a.drawn(a.points) + shift, b.drawn(b.points)
-        begins = enclosed(against, b.facets, drawn) != b.outside
         crossing, _ = crossings(Way(drawn, drawn, a.facets), Way(against, against, b.facets))
-        begins[a.facets[crossing]] = True
+        begins = _within(drawn, a.facets, crossing, against, b)
         near = np.flatnonzero(a.rooted & ~begins & _in_box(a.points + shift, b.points, a.amount))
         roots = begins.copy()
         roots[near[np.abs(depths(a.points[near] + shift, b.points, b.facets)) <= a.amount[near]]] = True
@@ -291,6 +292,19 @@ def _still(scene: Scene) -> list[_Thing]:
         found.append(_Thing(f"obstacles.{name}", facets, points, outside=scene.obstacles[name].outside))
     walls = side_walls(scene).items()
     return found + [_Thing(f"fluid.sides.{side}", facets, points) for side, (points, facets) in walls]
+
+
+def _within(x: np.ndarray, facets: np.ndarray, crossing: np.ndarray, points: np.ndarray, thing: _Thing) -> np.ndarray:
+    """Return which points of a surface are in a thing whose own are at ``points``, or on facets that cross it.
+
+    Of those that facets join which do not cross it, all are in it or none is.
+    """
+    joined = facets[~crossing][:, [*range(1, x.shape[1]), 0]].ravel(), facets[~crossing].ravel()
+    graph = coo_matrix((np.ones(len(joined[0]), dtype=np.int8), joined), shape=(len(x), len(x)))
+    _, first, label = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
+    within = (enclosed(points, thing.facets, x[first]) != thing.outside)[label.ravel()]
+    within[facets[crossing]] = True
+    return within
 
 
 def _in_box(at: np.ndarray, points: np.ndarray, margin: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import bench, cli
-from petfsi.bench import case, report, solid_speed, stability, theory
-from petfsi.errors import InputError
+from petfsi.bench import case, extremes, report, solid_speed, stability, theory
+from petfsi.errors import InputError, SolveError
 
 
 def test_the_first_wave_number_solves_its_equation_and_knows_its_limits():
@@ -185,3 +185,26 @@ def test_without_a_name_the_benches_are_listed(capsys):
 def test_a_bench_that_is_not_there_is_told(capsys):
     assert cli.main(["bench", "columm"]) == 2
     assert "columm: no such bench; there are " + ", ".join(bench.BENCHES) in capsys.readouterr().err
+
+
+# ---- extremes -----------------------------------------------------------------------------------------------
+
+
+def test_a_run_at_an_extreme_is_right_wrong_or_stopped():
+    def entered(measure):
+        made = report.Report("")
+        extremes._enter(made, {"part": "rest"}, measure, MPI.COMM_SELF)
+        return made.rows[0]["verdict"], made.rows[0]["why"], len(made.failures)
+
+    def stops(*_):
+        raise SolveError("it has blown up: so much")
+
+    assert entered(lambda *_: {"speed": (-0.1, 0.2), "created": (0.0, 0.0)}) == ("right", "", 0)
+    assert entered(lambda *_: {"speed": (-0.3, 0.2), "created": (np.nan, 1.0)}) == ("wrong", "speed, created", 1)
+    assert entered(stops) == ("stopped", "it has blown up", 0)
+
+
+def test_a_light_rigid_disk_keeps_its_share_of_the_speed():
+    row = {"rho": 1e-2, "E": 1e12, "cells a step": 1.0, "scheme": "newmark", "transfer": "cutcell"}
+    found = extremes._set_off(MPI.COMM_WORLD, row)
+    assert all(abs(value) <= bound for value, bound in found.values()) and "speed or frequency" in found

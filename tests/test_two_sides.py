@@ -359,7 +359,7 @@ def test_buoyancy_at_links_that_come_and_go_is_entered():
                   "sides": {"left": "periodic", "right": "periodic", "top": "open"}},
         "solids": {"ring": {"shape": {"box": {"origin": [0.42, 0.4], "size": [0.4, 0.4], "cells": [8, 8]}},
                             "density": 2.0, "young": 2000.0, "poisson": 0.3,
-                            "initial": {"velocity": ["-3*(y-0.6)", "3*(x-0.62)"]}}},
+                            "initial": {"velocity": ["-10*(y-0.6)", "10*(x-0.62)"]}}},
         "obstacles": {"strip": {"shape": {"box": {"origin": [0.0, 0.27], "size": [0.45, 0.002]}}}},
     }  # fmt: skip
     with simulation(MPI.COMM_WORLD, Scene.model_validate(scene), "monolithic.opts") as sim:

@@ -196,6 +196,33 @@ def test_bdf2_loses_its_own_loss_under_whatever_drives_it(drive):
     assert 0.01 < taken / rows[0]["kinetic"] < 1.0
 
 
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("integrator", ["bdf2", "static"])
+def test_a_load_without_a_value_at_time_zero_is_that_of_the_first_step(integrator):
+    pull = [{"where": "right", "traction": ["5 + 0*x/t", 0.0]}]
+    got = history(bar(integrator, 10, 0.0, loads=pull), 2)
+    constant = history(bar(integrator, 10, 0.0, loads=[{"where": "right", "traction": [5.0, 0.0]}]), 2)
+    np.testing.assert_allclose(got["load_work"], constant["load_work"], rtol=1e-12)
+
+
+def test_a_plate_that_a_load_swings_far_loses_what_one_that_swings_little_does():
+    """By a quarter of its length, 40 steps a period: midpoint keeps the energy, bdf2 takes what it always does."""
+
+    def lost(integrator, pull, material):
+        body = {
+            "shape": {"box": {"origin": [0.0, 0.0], "size": [1.0, 0.1], "cells": [20, 2]}}, "supports": [STILL],
+            "density": 1000.0, "young": 1e6, "poisson": 0.3, "material": material,
+            "loads": [{"where": "top", "traction": [0.0, f"{pull}*sin(2*t)"]}],
+        }  # fmt: skip
+        got = history(scene(integrator, np.pi / 40, solids={"plate": body}), 40)
+        return got["energy_residual"] / np.abs(got["load_work"]).max()
+
+    assert np.abs(lost("midpoint", 100.0, "green")).max() < 0.01
+    little = lost("bdf2", 1.0, "linear")
+    assert little[-1] < -0.02
+    np.testing.assert_allclose(lost("bdf2", 100.0, "green"), little, atol=0.005)
+
+
 # ---- in a fluid ---------------------------------------------------------------------------------------------
 
 

@@ -27,6 +27,7 @@ BENCHES = {
     "column": Bench("a layer under water: frequency, damping and energy against theory", "4 min", "1 min"),
     "added-mass": Bench("added mass of a disk and a ball between the cells of a grid, against theory", "4 min", "45 s"),
     "walls": Bench("flows along and past walls, bodies that fall, thin sheets, against exact ones", "10 min", "1 min"),
+    "extremes": Bench("thirty runs at extremes: right by a stated check, or stopped by name", "1 min", "20 s"),
     "interface": Bench("error against seconds: published and split schemes beside cut cells", "10 min", "1 min"),
     "splitting": Bench("growth per step of the split scheme, against linear theory", "30 s", "10 s"),
     "stability": Bench("which schemes, steps and dampings keep the bar in a jet bounded", "90 min", "4 min"),

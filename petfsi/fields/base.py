@@ -127,8 +127,6 @@ class Field(ABC):
     row_scale, col_scale : float
         The solver sees ``row_scale * block * col_scale`` and unknowns divided by ``col_scale``, so that all
         rows and unknowns are comparable numbers.
-    is_linear : bool
-        Whether its equations are linear in its unknowns.
     n_assembled : int
         How often the block was assembled.
     pattern_version : int
@@ -145,7 +143,6 @@ class Field(ABC):
     rhs: np.ndarray
     row_scale: float = 1.0
     col_scale: float = 1.0
-    is_linear: bool = True
     n_assembled: int = 0
     pattern_version: int = 0
 
@@ -494,7 +491,7 @@ class SolidField(Field):
 
     @abstractmethod
     def starting_forces(self) -> Forces:
-        """Return the same of the present state at time zero, reactions in statics alone: it is at rest. Collective."""
+        """Return the same of the present state at time zero, as far as it is known. Collective."""
 
     @abstractmethod
     def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:

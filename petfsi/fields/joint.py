@@ -316,11 +316,14 @@ class JointSolid(SolidField):
         return self._together([part.starting_forces() for part in self.parts])
 
     def _together(self, every: list[Forces]) -> Forces:
-        given = {name for forces in every for name in forces}
-        total = {name: np.zeros(self.layout.n_local) for name in self.acting if name in given}
+        """Return the forces of all parts as one, as far as each that they act on knows them."""
+        missing = {
+            name for part, forces in zip(self.parts, every, strict=True) for name in part.acting if name not in forces
+        }
+        total = {name: np.zeros(self.layout.n_local) for name in self.acting if name not in missing}
         for piece, forces in zip(self._pieces, every, strict=True):
-            for name, force in forces.items():
-                total[name][piece] = force
+            for name in total.keys() & forces.keys():
+                total[name][piece] = forces[name]
         return total
 
     def work(self, dt: float) -> Work:

@@ -23,6 +23,8 @@ from petfsi.scene.tables import Cylinder, Shape
 SNAP = 1e-12
 #: A cylinder whose axis leans less than this against a plane is cut in a strip.
 PARALLEL = 1e-8
+#: In 2D the second coordinate in a side reaches from here to there.
+DUMMY = (-0.5, 0.5)
 #: Rounding errors of a coordinate.
 ROUNDING = 8 * float(np.finfo(float).eps)
 
@@ -80,10 +82,10 @@ def parts_within(
     if section is None:
         return np.zeros(len(low)), centroid
     flat = np.zeros((len(low), 2, 2))
-    flat[:, 1] = -0.5, 0.5
+    flat[:, 1] = DUMMY
     for n, b in enumerate(others):
         flat[:, n, 0], flat[:, n, 1] = low[:, b], high[:, b]
-    areas, middles = _clip(flat, section.lines, section.circle)
+    areas, middles = _clip(flat[:, [0, 1], [[0, 0], [1, 0], [1, 1], [0, 1]]], section.lines, section.circle)
     size = flat[:, :, 1] - flat[:, :, 0]
     slack = SNAP + ROUNDING * np.max(np.abs(flat).max(axis=2) / size, axis=1)
     part = np.clip(areas / size.prod(axis=1), 0.0, 1.0)
@@ -102,17 +104,47 @@ def jet_parts(
         middle = 0.5 * (low + high)
         middle[:, axis] = at
         return np.ones(len(low)), middle
-    origin, dim = np.array(fluid.origin, dtype=float), low.shape[1]
-    period, reach = periods(fluid, dim), bounds(region)
-    moves = [np.zeros(dim)] if reach is None else images(period, reach, (origin, origin + fluid.size))
     part, moment = np.zeros(len(low)), np.zeros(low.shape)
-    for shift in moves:
+    for shift in _moves(fluid, region, low.shape[1]):
         share, centroid = parts_within(region, axis, at, low - shift, high - shift)
         part += share
         moment += share[:, None] * (centroid + shift)
     some = part > 0.0
     moment[some] /= part[some, None]
     return np.minimum(part, 1.0), moment
+
+
+def areas_within(fluid: MacFluid, region: Shape, axis: int, at: float, corners: np.ndarray) -> np.ndarray:
+    """Return the area of quadrilaterals in a side within a jet's region and its images around periodic axes.
+
+    Parameters
+    ----------
+    fluid, region : MacFluid, Shape
+    axis, at : int, float
+        The side.
+    corners : ndarray, shape (n, 4, 2)
+        By the coordinates along the other axes (the second is ``DUMMY`` in 2D), anticlockwise, m.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        m^2 (m in 2D).
+    """
+    dim = len(fluid.origin)
+    others = [b for b in range(dim) if b != axis]
+    area = np.zeros(len(corners))
+    for shift in _moves(fluid, region, dim):
+        section = _section(region, axis, at, others)
+        if section is not None:
+            moved = corners - [*shift[others], 0.0][:2]
+            area += _clip(moved, section.lines, section.circle)[0]
+    return area
+
+
+def _moves(fluid: MacFluid, region: Shape, dim: int) -> list[np.ndarray]:
+    """Return by how much the images of a region are moved that may meet the grid, m."""
+    origin, period, reach = np.array(fluid.origin, dtype=float), periods(fluid, dim), bounds(region)
+    return [np.zeros(dim)] if reach is None else images(period, reach, (origin, origin + fluid.size))
 
 
 def check_jets(fluid: MacFluid, dim: int) -> None:
@@ -209,20 +241,20 @@ def _of_cylinder(cylinder: Cylinder, axis: int, at: float, others: list[int]) ->
 
 
 @njit(cache=True)
-def _clip(rectangles, lines, circle):
-    """Return area and centroid of what lines and the circle leave of rectangles, (n, 2, 2): coordinate, low and high.
+def _clip(corners, lines, circle):
+    """Return area and centroid of what lines and the circle leave of quadrilaterals, (n, 4, 2), anticlockwise.
 
     Of empty parts the centroid is the middle.
     """
-    areas, middles = np.zeros(len(rectangles)), np.zeros((len(rectangles), 2))
+    areas, middles = np.zeros(len(corners)), np.zeros((len(corners), 2))
     polygon, other = np.empty((4 + len(lines), 2)), np.empty((4 + len(lines), 2))
-    for n in range(len(rectangles)):
-        (y0, y1), (z0, z1) = rectangles[n]
+    for n in range(len(corners)):
         # about the middle, so that differences of coordinates keep their digits
-        y, z = 0.5 * (y0 + y1), 0.5 * (z0 + z1)
+        y = 0.25 * (corners[n, 0, 0] + corners[n, 1, 0] + corners[n, 2, 0] + corners[n, 3, 0])
+        z = 0.25 * (corners[n, 0, 1] + corners[n, 1, 1] + corners[n, 2, 1] + corners[n, 3, 1])
         middles[n] = y, z
-        polygon[0], polygon[1] = (y0 - y, z0 - z), (y1 - y, z0 - z)
-        polygon[2], polygon[3] = (y1 - y, z1 - z), (y0 - y, z1 - z)
+        for i in range(4):
+            polygon[i] = corners[n, i, 0] - y, corners[n, i, 1] - z
         count = 4
         for a, b, c in lines:
             count = _cut(polygon, count, a, b, c - a * y - b * z, other)

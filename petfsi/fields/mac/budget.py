@@ -1,6 +1,6 @@
 """What a fluid on a staggered grid holds, and what forces and sides do to it: momentum and energy by faces.
 
-A face that the pressure acts on has the mass m_f = rho alpha_f A_f dx; at an open side, where p = 0 lies half a cell
+A face that the pressure acts on has the mass m_f = rho alpha_f A_f dx; at an open side, where p is given half a cell
 away, it has half of that. With it a step's kick, v_w = v* - (c/rho) G p, does exactly the work of the pressure on all
 walls:
 

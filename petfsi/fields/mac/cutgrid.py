@@ -183,7 +183,8 @@ class CutGrid:
 
     def _to_jets(self, found: CutCells, facets: np.ndarray, links: Links) -> np.ndarray:
         """Return how open links through sides are to jets, see ``jet_cuts``."""
-        return jet_openings(found, facets, self.lattice, links, self.surroundings.jets, self._box_faces)
+        around = self.surroundings
+        return jet_openings(found, facets, self.lattice, links, around.jets, around.fluid, self._box_faces)
 
     def _box_faces(self, jet: Jet) -> np.ndarray:
         """Return the flat indices of a jet's faces in the box; -1 beyond it."""

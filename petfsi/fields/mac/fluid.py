@@ -254,10 +254,10 @@ class MacFluid(CoveredGrid):
         self._forces = forces = budget.Forces.of(gravity, heavy, buoyancy, smoke, link_smoke)
         before = None if local is None else local.at_faces(self.velocity_star)
         self.open_sides.evaluate(time, gravity)
-        self.open_sides.push(self.velocity_star, self.face_kind, duration)
+        self.open_sides.push(self.velocity_star, duration)
         if self.weight is not None:
             self.weight.at(time)
-            self.weight.push_open_sides(self.velocity_star, self.face_kind, duration)
+            self.weight.push_open_sides(self.velocity_star, duration)
         if local is not None and before is not None:
             pushed = local.gathered(local.at_faces(self.velocity_star) - before, local.link)
             if forces is not None:

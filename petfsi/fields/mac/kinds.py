@@ -15,7 +15,7 @@ OUTSIDE = 4  # beyond a side
 # faces
 DEAD = 0  # the velocity is not determined
 PRESSURE = 1  # between two fluid cells
-OPEN = 2  # between fluid and an open side: p = 0 at the face
+OPEN = 2  # between fluid and an open side: p is given at the face
 WALL = 3  # velocity prescribed by a side, an inflow or an obstacle
 SOLID_FACE = 4  # velocity given by a coupling
 SPLIT = 5  # of a cell with several pieces of fluid: its parts join unknowns as the openings' extras say

@@ -22,7 +22,7 @@ import numpy as np
 
 from petfsi.fields.mac.faces import Faces
 from petfsi.fields.mac.grid import MacGrid
-from petfsi.fields.mac.kinds import OPEN, SPLIT
+from petfsi.fields.mac.kinds import OPEN
 from petfsi.fields.mac.parts import Parts
 from petfsi.fields.mac.sides import NAMES, wrapped_points
 from petfsi.ranks import agreed
@@ -175,12 +175,14 @@ class OpenSides:
         inward, sign = self.link_inward[row], np.where(upper, -1.0, 1.0)
         return p + self.density * inward * (0.5 * inward - sign * velocity)
 
-    def push(self, star: list[np.ndarray], face_kind: list[np.ndarray], duration: float) -> None:
-        """Accelerate the velocity at the sides by their pressure for ``duration`` seconds."""
+    def push(self, star: list[np.ndarray], duration: float) -> None:
+        """Accelerate the velocity at the sides by their pressure for ``duration`` seconds.
+
+        On all faces, because a body may yet uncover some in this step: what is given elsewhere is not asked for v*.
+        """
         for side in self.given:
             factor = 2.0 * side.sign * duration / (self.density * self.grid.dx[side.axis])
-            open_ones = np.isin(face_kind[side.axis][side.plane], (OPEN, SPLIT))
-            star[side.axis][side.plane] += np.where(open_ones, factor * side.pressure, 0.0)
+            star[side.axis][side.plane] += factor * side.pressure
 
     # ---- the total pressure of what comes in ------------------------------------------------------------------
 

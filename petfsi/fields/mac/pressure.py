@@ -1,7 +1,7 @@
 """The pressure block L = -(dt/rho) D2 G, its right-hand side, and the projection with its solution.
 
 D is the net outflow of a cell in m^3/s, G the difference of the two cells at a face by their distance; at an OPEN
-face p = 0 lies half a cell away.
+face p = 0 lies half a cell away, and whatever else is given there has pushed v* already (see ``open_sides``).
 """
 
 from __future__ import annotations

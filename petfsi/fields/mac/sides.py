@@ -154,6 +154,8 @@ class Surroundings:
 
     Attributes
     ----------
+    fluid : MacFluid
+        The table of the scene.
     cell_kind : ndarray of uint8
         Cell array of FLUID, OBSTACLE and OUTSIDE, valid in all ghosts.
     side_kind : list of ndarray of uint8
@@ -172,7 +174,7 @@ class Surroundings:
 
     def __init__(self, grid: MacGrid, fluid: MacFluid):
         check_jets(fluid, grid.dim)
-        self.grid, self._fluid, sides = grid, fluid, fluid.sides
+        self.grid, self.fluid, sides = grid, fluid, fluid.sides
         self.cell_kind = np.full(grid.shape(None), kinds.OUTSIDE, dtype=np.uint8)
         self.cell_kind[grid.inside(None)] = kinds.FLUID
         self.side_kind = [np.full(grid.shape(axis), kinds.WALL, dtype=np.uint8) for axis in range(grid.dim)]
@@ -203,7 +205,7 @@ class Surroundings:
         if isinstance(side, GridInflowSide):
             # a face that a jet takes a part of is closed for the rest
             key = f"fluid.sides.{name}.inflow"
-            jet = Jet.through(grid, self._fluid, side.inflow, key, axis, upper, tuple(part))
+            jet = Jet.through(grid, self.fluid, side.inflow, key, axis, upper, tuple(part))
             self.side_kind[axis][jet.faces] = kinds.WALL
             self.jets.append(jet)
 

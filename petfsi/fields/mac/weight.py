@@ -1,9 +1,9 @@
 """Gravity without spurious currents: the pressure of a fluid at rest is split off and integrated exactly.
 
 With x_0 the upper corner of the grid, p = p' + rho g . (x - x_0). Gravity then drives nothing inside the fluid; it
-acts through open sides, where p = 0 means p' = -rho g . (x - x_0), and through walls, where the force of the second
-part is an exact integral over facets. A fluid at rest has p' constant, whatever cuts the grid, and buoyancy is that
-of the volume which the surface encloses.
+acts through open sides, where p means p' = p - rho g . (x - x_0) (p itself is what ``open_sides`` adds), and through
+walls, where the force of the second part is an exact integral over facets. A fluid at rest has p' constant, whatever
+cuts the grid, and buoyancy is that of the volume which the surface encloses.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from petfsi.fields.mac.grid import MacGrid
-from petfsi.fields.mac.kinds import OPEN, SPLIT
 from petfsi.scene.expressions import Expression
 
 
@@ -55,8 +54,8 @@ class Weight:
             total = total + self.gradient[a] * (coordinates[a] - self.origin[a])
         return total
 
-    def push_open_sides(self, star: list[np.ndarray], face_kind: list[np.ndarray], duration: float) -> None:
-        """Accelerate the velocity at open sides by p' there, for ``duration`` seconds."""
+    def push_open_sides(self, star: list[np.ndarray], duration: float) -> None:
+        """Accelerate the velocity at open sides by p' there, for ``duration`` seconds, as ``OpenSides.push`` does."""
         grid = self.grid
         for a in range(grid.dim):
             for upper in (False, True):
@@ -67,4 +66,4 @@ class Weight:
                 lines = [x[s] for x, s in zip(grid.lines(a), part, strict=True)]
                 p = -self.on(list(np.meshgrid(*lines, indexing="ij", sparse=True)))
                 push = (-2.0 if upper else 2.0) * duration / (self.density * grid.dx[a])
-                star[a][part] += np.where(np.isin(face_kind[a][part], (OPEN, SPLIT)), push * p, 0.0)
+                star[a][part] += push * p

@@ -30,7 +30,7 @@ from petfsi.geometry.places import Tags, read_tags, with_middles
 from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, relinearised, stable_step
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
-from petfsi.scene.expressions import Expression
+from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Number
@@ -560,14 +560,20 @@ class NodalSolid(SolidField):
         return found
 
     def starting_forces(self) -> Forces:
-        """Return the same of the present state at time zero, reactions in statics alone: it is at rest. Collective."""
+        """Return the same of the present state at time zero, reactions in statics alone: it is at rest. Collective.
+
+        Nothing where an expression has no value yet.
+        """
         d = self._with_shared(self.displacement)
         found: Forces = {}
-        if self._gravity:
-            gravity = np.array([float(g(t=0.0)) for g in self._gravity])
-            found["gravity"] = gravity @ self._uniform.reshape(self.dim, -1)
-        if self._loads is not None:
-            found["loads"] = self._loads.start(d).ravel()
+        try:
+            if self._gravity:
+                gravity = np.array([float(g(t=0.0)) for g in self._gravity])
+                found["gravity"] = gravity @ self._uniform.reshape(self.dim, -1)
+            if self._loads is not None:
+                found["loads"] = self._loads.start(d).ravel()
+        except ExpressionError:  # on all ranks
+            return {}
         if self._reacts and not self._has_inertia:
             rest = np.zeros_like(d)
             found["boundary"] = self._reaction(State(d, rest, rest), found)
