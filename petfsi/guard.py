@@ -13,15 +13,17 @@ from petfsi.scene.schema import Scene
 
 #: Energies below this part of the weight of all water times the height of its box are round-off.
 ROUND_OFF = 1e-9
+#: In so many steps running: of what begins at rest the first ones have little to compare with.
+PATIENCE = 3
 
 
 class EnergyGuard:
     """Compares the energy that nothing accounts for with what a run has held or was given.
 
-    With E = kinetic + elastic energy and what damping took so far, and R = ``energy_residual``, see ``accounts``,
-    E - R is what a run began with and what gravity, loads, supports and sides have done to it since. Once R exceeds
-    ``time.energy_limit`` times the largest E - R so far the motion is the scheme's own. A scheme's damping makes R
-    negative, and that is never judged.
+    With E = kinetic + elastic energy and what damping took so far, and R = ``energy_residual``, see ``accounts``, E - R
+    is what a run began with and what gravity, loads, supports and sides have done to it since. Once R exceeds
+    ``time.energy_limit`` times the largest E - R so far, ``PATIENCE`` times running, the motion is the scheme's own. A
+    scheme's damping makes R negative, and that is never judged.
 
     Without the accounts there is nothing to judge, nor in statics, where no step goes on from the energy of the last.
 
@@ -35,12 +37,14 @@ class EnergyGuard:
     watches : bool
     largest : float
         The largest E - R so far, J.
+    beyond : int
+        How many of the last steps had too much.
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene) -> None:
         self.comm, self.limit = comm, scene.time.energy_limit
         self.watches = watches(scene)
-        self.largest = 0.0
+        self.largest, self.beyond = 0.0, 0
         self._floor = ROUND_OFF * _weight(scene)
 
     def judge(self, values: Mapping[str, float], advice: str) -> None:
@@ -63,7 +67,8 @@ class EnergyGuard:
         parts = {name: values.get(name, 0.0) for name in ("kinetic", "elastic", "dissipated")}
         held = sum(parts.values()) - residual
         self.largest = max(self.largest, held)
-        if not self.watches or residual <= self.limit * max(self.largest, self._floor):
+        self.beyond = 0 if residual <= self.limit * max(self.largest, self._floor) else self.beyond + 1
+        if not self.watches or self.beyond < PATIENCE:
             return
         grown = max(parts, key=lambda name: parts[name])
         raise SolveError(
@@ -75,11 +80,13 @@ class EnergyGuard:
 
     def state(self) -> dict[str, Slab]:
         """Return what the next step is judged by."""
-        return {"largest": scalar_slab(self.comm, self.largest)}
+        numbers = {"largest": self.largest, "beyond": self.beyond}
+        return {name: scalar_slab(self.comm, value) for name, value in numbers.items()}
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
-        self.largest = float(read("largest", (0,), (1,))[0])
+        self.largest, beyond = (float(read(name, (0,), (1,))[0]) for name in ("largest", "beyond"))
+        self.beyond = int(beyond)
 
 
 def watches(scene: Scene) -> bool:

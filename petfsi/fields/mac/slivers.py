@@ -38,6 +38,8 @@ from petfsi.geometry.clipping import CutCells
 LEAST = 0.1
 #: Walls with a smaller |∫ n dA| than this part of their area have no common normal, and no sliver: films and corners.
 COMMON = 0.7
+#: Nor have those that only graze a cell.
+GRAZING = 0.01
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,8 @@ def slivers_of(cut: CutCells, slot: np.ndarray, n_moving: int, links: Links, dx:
     normal = np.column_stack([np.bincount(of, area * n, len(slots)) for n in normals.T])
     total, reach = np.bincount(of, area, len(slots)), np.bincount(of, reach, len(slots))
     squared = np.sum(normal**2, axis=1)
-    use = np.flatnonzero((squared > (COMMON * total) ** 2) & (reach != 0.0))
+    least = np.maximum(COMMON * total, GRAZING * np.prod(dx) ** (1 - 1 / len(dx)))
+    use = np.flatnonzero((squared > least**2) & (reach != 0.0))
     slots, size, normal = slots[use], reach[use] / squared[use], normal[use]
     negative = np.zeros(n_slots, dtype=bool)
     negative[slots[size < 0.0]] = True
