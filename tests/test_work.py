@@ -232,10 +232,10 @@ def paddle(steps, transfer):
     """A block that its supports push through a closed box of water, little enough that no face opens or closes."""
     push = {"where": "all", "fix": ["x", "y"], "displacement": {"x": "1e-6*t**3"}}
     body = {
-        "shape": {"box": {"origin": [0.4, 0.3], "size": [0.2, 0.3], "cells": [2, 3]}},
+        "shape": {"box": {"origin": [5 / 12, 0.25], "size": [2 / 12, 0.25], "cells": [2, 3]}},
         "density": 800.0, "young": 1e5, "poisson": 0.3, "supports": [push],
     }  # fmt: skip
-    return scene("bdf2", 1 / steps, transfer, fluid=fluid((10, 10)), solids={"block": body})
+    return scene("bdf2", 1 / steps, transfer, fluid=fluid((12, 12)), solids={"block": body})
 
 
 def layer(steps, transfer):
