@@ -140,6 +140,7 @@ class Newton:
         self._x.array = system.solution.array_r
         for field in system.fields:
             self._x.array[system.piece(field.name)] = field.linearised_at() / field.col_scale
+        self._drop_coarse_guess()
         self._at = self._x.array_r.copy()
         if self._reads_floor:
             snes.setTolerances(atol=self._floor(self._x))
@@ -154,6 +155,20 @@ class Newton:
             raise SolveError(self._story(norms))
         scale = norms["rhs"] if norms[""] > floor else floor / np.finfo(float).eps
         return snes.getIterationNumber(), self._iterations, float(norms[""] / scale) if scale > 0 else 0.0
+
+    def _drop_coarse_guess(self) -> None:
+        """Begin from zero where equations are linear if the guess is too coarse to get from it to zero. Collective.
+
+        What is no better than none, and whose round-off is more than what is wanted of the right-hand side, would have
+        that taken for the solution.
+        """
+        system = self.system
+        norms = system.update_residual(self._x)
+        wanted = self.snes.getTolerances()[0] * norms["rhs"]
+        if wanted < self._floor(self._x) and not norms[""] <= norms["rhs"]:
+            for field in system.fields:
+                if field.is_linear:
+                    self._x.array[system.piece(field.name)] = 0.0
 
     def _floor(self, x: PETSc.Vec) -> float:
         """Return the norm of the function that is round-off at x. Collective."""

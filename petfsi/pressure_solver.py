@@ -177,15 +177,15 @@ class PressureSolver:
         """Hold on to no solver any longer."""
         self._ksp = self._multigrid = self._resisted = None
 
-    def round_off(self) -> float:
-        """Return what the residual of the pressure's rows cannot fall below at the solution there. Collective.
+    def round_off(self, b: PETSc.Vec, x: PETSc.Vec) -> float:
+        """Return what the residual of the pressure's rows cannot fall below at x. Collective.
 
-        Where that is still nothing, at what the preconditioner makes of the right-hand side.
+        Where that is still nothing, at what the preconditioner makes of b.
         """
-        pressure = self.system.values()[self.system.fields.index(self.fluid)]
+        pressure = self.system.values(x)[self.system.fields.index(self.fluid)]
         if self._ksp is not None and not self.system.comm.allreduce(bool(pressure.any()), MPI.LOR):
             guess, known = self.fluid.block.createVecs()
-            known.array = self.system.rhs.array_r[self.system.piece(self.fluid.name)]
+            known.array = b.array_r[self.system.piece(self.fluid.name)]
             self._ksp.setUp()
             self._ksp.getPC().apply(known, guess)
             pressure = guess.array_r * self.fluid.col_scale

@@ -93,6 +93,7 @@ class Simulation:
         self.regions: ClosedRegions | None = None
         if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
+        self._check_start()
         self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.guard = EnergyGuard(comm, scene)
@@ -214,7 +215,6 @@ class Simulation:
     def rehearse(self) -> None:
         """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
         self.dt = self._length(self.time)
-        self._check_start()
         self.stable.count(self.time, self.dt)
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
@@ -333,8 +333,8 @@ class Simulation:
         way = float(np.abs(self.solid.surface_present()).max(initial=0.0))
         if not way < FAR * self.solid.extent:
             raise InputError(
-                f"the solids' initial displacement: brings a point {way:.3g} m off, which is more than {FAR:g} times "
-                f"the largest side of the solids ({self.solid.extent:g} m)"
+                f"solids: displacements bring a point {way:.3g} m off at the start, more than {FAR:g} times the "
+                f"largest side of the solids ({self.solid.extent:g} m)"
             )
 
     def _check_speed(self, solid: SolidField, fastest: float, dt: float) -> float:

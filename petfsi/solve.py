@@ -362,12 +362,13 @@ class Solver:
         """
         system, ksp = self.system, self._ksp
         assert ksp is not None
-        size, floor = b.norm(), self._floor()
-        if not np.isfinite(size + floor):
-            raise SolveError(blown_up([field.name for field in system.fields]))
+        size = b.norm()
         rtol, warm = ksp.getTolerances()[0], ksp.getInitialGuessNonzero() and not self.fixed_iterations
         if warm:
             self._drop_coarse_guess(b, x, rtol * size, size)
+        floor = self._floor(b, x)
+        if not np.isfinite(size + floor):
+            raise SolveError(blown_up([field.name for field in system.fields]))
         if ksp.getType() != PETSc.KSP.Type.PREONLY:
             if not PETSc.Options(self.prefix).hasName("ksp_atol"):
                 ksp.setTolerances(atol=floor)
@@ -377,7 +378,7 @@ class Solver:
         lost = 0.0
         norms = system.update_residual(x, b)
         if norms[""] > max(rtol * size, floor) and not self.fixed_iterations:
-            floor = self._floor()  # the first guess may have been nothing
+            floor = self._floor(b, x)  # the first guess may have been nothing
             if warm and ksp.getConvergedReason() > 0 and norms[""] > max(rtol * size, floor):
                 # what iterations update drifts from the true residual by round-off: they go on from there
                 iterations += self._run(b, x)
@@ -392,10 +393,10 @@ class Solver:
         if wanted < self.system.round_off_at(x) and not self.system.update_residual(x, b)[""] <= size:
             x.set(0.0)
 
-    def _floor(self) -> float:
-        """Return what the residual cannot fall below at pressures as they are in the system's solution. Collective."""
+    def _floor(self, b: PETSc.Vec, x: PETSc.Vec) -> float:
+        """Return what the residual cannot fall below at the pressures in x. Collective."""
         floor = self.system.rhs_round_off()
-        return floor if self._pressure is None else max(floor, self._pressure.round_off())
+        return floor if self._pressure is None else max(floor, self._pressure.round_off(b, x))
 
     def _run(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
         """Run the solver; return its iterations, of the inner one if that takes more. Collective."""

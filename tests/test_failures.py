@@ -391,24 +391,27 @@ WEAK += ["-fsi_fieldsplit_pressure_ksp_max_it", "2"]
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_solver_that_does_not_converge_is_named(scene, ranks):
-    gently = ["--set", "fluid.sides.left.inflow.ramp=1.0"]  # else the velocities at the start want a solve, too
-    done = petfsi("run", scene, "--out", "out", *gently, *WEAK, ranks=ranks)
+    slowly = ["--set", "fluid.sides.left.inflow.ramp=0.2"]
+    done = petfsi("run", scene, "--out", "out", *slowly, *WEAK, ranks=ranks)
     has_failed(done, "out", "step 1, t = 0.05 s: solver 'fsi_", "DIVERGED_MAX_IT", "by field: solid ", ", pressure ")
     assert "There is no checkpoint." in done.stderr
     assert len(read_history("out/history.csv")["step"]) == 1
 
 
-def test_a_solver_that_does_not_converge_at_the_start_is_named(scene):
-    done = petfsi("run", scene, "--out", "out", *WEAK)
-    assert done.returncode == 3 and "Traceback" not in done.stderr and not Path("out").exists()
-    assert "the velocities at t = 0 cannot be made to fit each other: solver 'fsi_" in done.stderr
+def test_a_start_that_is_not_found_is_named_before_anything_is_written(scene, here):
+    done = here("run", scene, "--out", "out", *WEAK)
+    is_clear(done, "the velocities at t = 0 cannot be made to fit each other: solver 'fsi_", "DIVERGED_MAX_IT")
+    assert done.returncode == 3 and not Path("out").exists()
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_state_that_blows_up_ends_the_run_and_names_the_checkpoint(tmp_path, ranks):
     out = tmp_path / "out"
-    done = petfsi("run", JOBS / "column.toml", "--out", out, "-options_file", "split.opts", *LIGHT, ranks=ranks)
-    has_failed(done, out, "energy has come out of nothing, most of it kinetic: ", "try monolithic.opts")
+    lets_go = ["--set", "time.energy_limit=-1"]
+    done = petfsi(
+        "run", JOBS / "column.toml", "--out", out, "-options_file", "split.opts", *LIGHT, *lets_go, ranks=ranks
+    )
+    has_failed(done, out, "solids.layer has turned an element inside out: det F = -", "smaller steps")
     last = int(re.search(r"Last good checkpoint: .*/(\d+)\.h5\.", done.stderr)[1])
     history = read_history(out / "history.csv")
     assert last == history["step"][-1] == json.loads((out / "summary.json").read_text())["steps"]

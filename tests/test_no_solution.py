@@ -77,7 +77,7 @@ BLOCKED = {
     "almost": (flow({"left": jet(0.2), "right": jet(-0.2 * (1 + 1e-6))}), "give off 8e-08 m^2/s"),
     "part of a side": (
         flow({"left": jet(0.1, region={"ball": {"centre": [0.0, 0.2], "radius": 0.11}}), "right": "open"}, None, PLUG),
-        "take up 0.02 m^2/s",
+        "take up 0.022 m^2/s",
     ),
     "periodic": (flow({"left": "periodic", "right": "periodic", "bottom": jet(0.1)}, {"d": disk()}), "take up 0.1 m"),
     "held plug": (

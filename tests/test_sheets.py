@@ -1,9 +1,12 @@
 """Sheets thinner than a cell: what is on one side of them is not felt on the other."""
 
+import numpy as np
 import pytest
 from mpi4py import MPI
 
 from petfsi.bench import walls_sheets
+from petfsi.bench.case import MONOLITHIC, simulation
+from petfsi.scene.schema import Scene
 
 
 @pytest.mark.parallel([1, 2, 3])
@@ -20,3 +23,14 @@ def test_a_beam_inside_a_cell_swings_at_second_order_without_damping():
         assert abs(damping) < 1e-4
         errors.append(abs(error))
     assert errors[1] < max(errors[0] / 3.2, 3e-4)
+
+
+def test_the_courant_number_of_divided_faces_is_that_along_their_axis():
+    sides = {"left": "periodic", "right": "periodic"}
+    fluid = {"density": 1.0, "origin": [0.0, 0.0], "size": [20.0, 1.0], "cells": [8, 8], "sides": sides}
+    sheet = {"shape": {"box": {"origin": [-1.0, 0.55], "size": [22.0, walls_sheets.THIN]}}}
+    scene = {"dim": 2, "time": {"end": 1.0, "dt": 0.1, "integrator": "bdf2"}, "obstacles": {"sheet": sheet}}
+    scene |= {"coupling": {"transfer": "cutcell"}, "fluid": fluid | {"initial": {"velocity": [3.0, 0.0]}}}
+    with simulation(MPI.COMM_SELF, Scene.model_validate(scene), MONOLITHIC) as sim:
+        assert np.abs(sim.fluid.velocity.parts).max() == 3.0
+        assert sim.fluid.cfl(0.1) == pytest.approx(3.0 * 0.1 * 8 / 20.0)

@@ -22,6 +22,7 @@ from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 
 MONOLITHIC, SPLIT, ITERATED = "monolithic.opts", "split.opts", "split-iterated.opts"
+DIRECT = "monolithic-direct.opts"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from petfsi import petsc
-from petfsi.bench.case import MONOLITHIC, SPLIT, Case, job, only_options
+from petfsi.bench.case import DIRECT, MONOLITHIC, SPLIT, Case, job, only_options
 from petfsi.bench.report import Report, Row
 from petfsi.errors import SolveError
 from petfsi.scene.schema import Scene
@@ -188,12 +188,14 @@ def _touch(sim: Simulation) -> None:
 
 
 def _words(options: str) -> list[str]:
-    """Return PETSc's command line for a shipped options file at the bench's tolerance."""
-    words = ["-options_file", options]
+    """Return PETSc's command line for a shipped options file, and options behind it, at the bench's tolerance."""
+    words = ["-options_file", *options.split()]
+    if options == DIRECT:
+        return words
     if options == SPLIT:
         return [*words, "-fsi_fieldsplit_pressure_ksp_rtol", f"{TOLERANCE:g}"]
     words += ["-fsi_ksp_rtol", f"{TOLERANCE:g}"]
-    if options == MONOLITHIC:  # its set-up counts, too
+    if options.startswith(MONOLITHIC):  # its set-up counts, too
         return [*words, "-fsi_fieldsplit_pressure_lag_change", "0"]
     return [*words, "-fsi_ksp_max_it", str(MOST_PAPER)]
 

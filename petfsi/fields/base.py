@@ -127,6 +127,8 @@ class Field(ABC):
     row_scale, col_scale : float
         The solver sees ``row_scale * block * col_scale`` and unknowns divided by ``col_scale``, so that all
         rows and unknowns are comparable numbers.
+    is_linear : bool
+        Whether its equations are linear in its unknowns.
     n_assembled : int
         How often the block was assembled.
     pattern_version : int
@@ -143,6 +145,7 @@ class Field(ABC):
     rhs: np.ndarray
     row_scale: float = 1.0
     col_scale: float = 1.0
+    is_linear: bool = True
     n_assembled: int = 0
     pattern_version: int = 0
 

@@ -466,7 +466,10 @@ class MacFluid(CoveredGrid):
     def cfl(self, dt: float) -> float:
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
         most = max(advect.largest(v) * dt / h for v, h in zip(self.velocity, self.grid.dx, strict=True))
-        most = max(most, advect.largest(self.velocity.parts) * dt / float(self.grid.dx.min()))
+        parts = self.velocity.parts
+        if len(parts):
+            assert self.sheets is not None
+            most = max(most, advect.largest(parts * dt / self.grid.dx[self.sheets.table.axis]))
         return self.comm.allreduce(most, op=MPI.MAX)
 
     def stock(self) -> Stock:
