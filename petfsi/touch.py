@@ -29,8 +29,10 @@ from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import images, periods
 
-#: Bodies are drawn in by this part of the shortest edge at each point, and of a cell at most: so deep they may go.
+#: Bodies are drawn in by this part of a cell, where there is no fluid of their median edge: so deep they may go.
 TOUCH = 0.01
+#: No point is drawn in by more than this part of the shortest edge there: sheets are thin.
+THIN = 0.25
 #: What is held in, or at, something from the start, or begins in it, may go deeper by this part of its shortest edge.
 ROOT = 0.5
 #: Where there is no clearance it is looked for again after so many steps.
@@ -316,14 +318,14 @@ class Watch:
 def _bodies(scene: Scene, solid: SolidField, x: np.ndarray) -> list[_Thing]:
     """Return the bodies of a scene where they are, x (n, dim)."""
     facets, owner, rooted = solid.surface().facets, solid.surface_bodies(), solid.surface_rooted()
-    cell = scene.fluid.resolution if scene.fluid is not None else np.inf
+    cell = scene.fluid.resolution if scene.fluid is not None else None
     edge = shortest_edges(x, facets)
     names, found = list(scene.solids), []
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     for begin, end in zip(starts, np.append(starts[1:], len(x)), strict=True):
         place = slice(int(begin), int(end))
         own = facets[owner[facets[:, 0]] == owner[begin]] - begin
-        amount = TOUCH * np.minimum(edge[place], cell)
+        amount = np.minimum(TOUCH * (cell or np.median(edge[place])), THIN * edge[place])
         radius = float(np.linalg.norm(x[place] - x[place].mean(axis=0), axis=1).max())
         about = place, amount, edge[place], rooted[place], float(np.median(amount)), radius
         found.append(_Thing(f"solids.{names[owner[begin]]}", own, x[place].copy(), *about))
