@@ -29,10 +29,14 @@ from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import images, periods
 
-#: Bodies are drawn in by this part of the shortest edge at each point, and of a cell at most: so deep they may go.
+#: Bodies are drawn in by this part of a cell, where there is no fluid of their median edge: so deep they may go.
 TOUCH = 0.01
+#: No point is drawn in by more than this part of the shortest edge there: sheets are thin.
+THIN = 0.25
 #: What is held in, or at, something from the start, or begins in it, may go deeper by this part of its shortest edge.
 ROOT = 0.5
+#: Where there is no clearance it is looked for again after so many steps.
+WAIT = 10
 #: What there is to do about it.
 WHY = "Nothing pushes bodies off yet, so the run stops where they touch"
 
@@ -120,7 +124,7 @@ class Watch:
     def __init__(self, comm: MPI.Comm, scene: Scene, solid: SolidField) -> None:
         self._period = periods(scene.fluid, scene.dim)
         self._repeats = bool(np.any(self._period > 0.0))
-        self._x = solid.surface_present()
+        self._x, self._room, self._wait = solid.surface_present(), 0.0, 0
         self._things = _bodies(scene, solid, self._x) + on_root(comm, lambda: _still(scene))
         self._n = len(scene.solids)
         bodies, others = np.triu_indices(self._n, 1, len(self._things))
@@ -140,7 +144,7 @@ class Watch:
 
     def resume(self, solid: SolidField) -> None:
         """Take the present positions as those of the last step. Collective."""
-        self._x = solid.surface_present()
+        self._x, self._room = solid.surface_present(), 0.0
 
     def judge(self, x: np.ndarray, t: float, dt: float) -> None:
         """Raise if anything meets in the step from t to t + dt that ends with points at x (n, dim). Not collective.
@@ -150,6 +154,11 @@ class Watch:
         TouchError
             On all ranks.
         """
+        # no two points can have come nearer than by twice the way of the fastest
+        self._room -= 2.0 * np.sqrt(x.shape[1]) * float(np.abs(x - self._x).max())
+        if self._room > 0.0:
+            self._x = x
+            return
         first, said = 2.0, ""
         parts: dict[tuple[int, int], list[Way]] = {}
         low, high = self._boxes(x)
@@ -166,6 +175,11 @@ class Watch:
         if said:
             raise TouchError(f"{said}, in the step from {t:.6g} s to {t + dt:.6g} s. {WHY}")
         self._x = x
+        self._wait = WAIT if self._wait == 0 else self._wait - 1
+        if self._wait == WAIT:
+            self._room = self._clearance(x, low, high)
+            # of what slides along each other there is none, and it need not be looked for in every step
+            self._wait = 0 if self._room > 0.0 else WAIT
 
     def _verb(self, one: int, other: int) -> str:
         a, b = self._things[one].name, self._things[other].name
@@ -194,6 +208,41 @@ class Watch:
         bulge = 0.5 * np.sqrt(turned)[:, None]
         self._turned = turned
         return np.concatenate((low - bulge, self._still[0])), np.concatenate((high + bulge, self._still[1]))
+
+    def _clearance(self, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+        """Return how much nearer two points may come, at least, before anything meets or goes too deep, m.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n, dim)
+            Present positions.
+        low, high : ndarray, shape (n_things, dim)
+            Boxes in which things are.
+        """
+        if self._repeats or any(root.other < self._n for root in self._roots):
+            return 0.0
+        one, other = self._pairs.T
+        gaps = np.maximum(low[other] - high[one], low[one] - high[other]).max(axis=1)
+        room = float(gaps[gaps > 0.0].min(initial=np.inf))
+        for a, b in self._pairs[gaps <= 0.0].tolist():
+            begin, end = self._judged_box(a, b, x)
+            begin_b, end_b = self._judged_box(b, a, x)
+            room = min(room, float(np.maximum(begin_b - end, begin - end_b).max()))
+            if room <= 0.0:
+                return 0.0
+        for root in self._roots:
+            a = self._things[root.thing]
+            way = np.linalg.norm(x[a.place][root.points] - a.points[root.points], axis=1)
+            room = min(room, float((ROOT * a.edge[root.points] - way).min()))
+        return room
+
+    def _judged_box(self, thing: int, other: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners of the box of what of a thing must not cross another, shape (dim,)."""
+        a = self._things[thing]
+        if a.place is None:
+            return self._still[0][thing - self._n], self._still[1][thing - self._n]
+        points = x[a.place][self._judged(thing, other)].reshape(-1, x.shape[1])
+        return points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
 
     # ---- whether they meet --------------------------------------------------------------------------------------
 
@@ -269,14 +318,14 @@ class Watch:
 def _bodies(scene: Scene, solid: SolidField, x: np.ndarray) -> list[_Thing]:
     """Return the bodies of a scene where they are, x (n, dim)."""
     facets, owner, rooted = solid.surface().facets, solid.surface_bodies(), solid.surface_rooted()
-    cell = scene.fluid.resolution if scene.fluid is not None else np.inf
+    cell = scene.fluid.resolution if scene.fluid is not None else None
     edge = shortest_edges(x, facets)
     names, found = list(scene.solids), []
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     for begin, end in zip(starts, np.append(starts[1:], len(x)), strict=True):
         place = slice(int(begin), int(end))
         own = facets[owner[facets[:, 0]] == owner[begin]] - begin
-        amount = TOUCH * np.minimum(edge[place], cell)
+        amount = np.minimum(TOUCH * (cell or np.median(edge[place])), THIN * edge[place])
         radius = float(np.linalg.norm(x[place] - x[place].mean(axis=0), axis=1).max())
         about = place, amount, edge[place], rooted[place], float(np.median(amount)), radius
         found.append(_Thing(f"solids.{names[owner[begin]]}", own, x[place].copy(), *about))

@@ -90,7 +90,7 @@ KINDS = {
     "triangles": (solid(ball([0.5, 0.5], 0.1, 4)), 2),
     "quadratic triangles": (solid(ball([0.5, 0.5], 0.1, 4), elements="quadratic"), 2),
     "beam": (solid(beam([0.5, 0.4], [0.5, 0.6], 0.02, 2)), 2),
-    "straight beam": (solid(beam([0.4, 0.42], [0.6, 0.5], 0.02, 2, theory="euler-bernoulli")), 2),
+    "straight beam": (solid(beam([0.4, 0.40929], [0.6, 0.48929], 0.02, 2, theory="euler-bernoulli")), 2),
     "tetrahedra": (solid(ball([0.5, 0.5, 0.5], 0.1, 2)), 3),
     "quadratic tetrahedra": (solid(box([0.4, 0.4, 0.4], [0.2, 0.2, 0.2], [1, 1, 1]), elements="quadratic"), 3),
 }
