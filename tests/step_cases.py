@@ -38,6 +38,8 @@ def prepared(scene, *options, comm=MPI.COMM_WORLD):
         sim = Simulation(comm, scene)
         sim.prepare()
         yield sim
+        # an error that is looked at keeps the simulation, and ranks would let go of it at different times
+        sim.solver.reset()
 
 
 def stepped(scene, n, *options, comm=MPI.COMM_WORLD):

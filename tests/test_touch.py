@@ -196,6 +196,7 @@ FALLS = {
 }
 
 
+@pytest.mark.parallel([1, 3])
 @pytest.mark.parametrize("name", FALLS)
 def test_a_body_that_sinks_stops_at_what_is_below_it_and_is_not_stepped_again(name):
     shape, obstacles, what, height = FALLS[name]
