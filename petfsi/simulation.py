@@ -333,8 +333,8 @@ class Simulation:
         way = float(np.abs(self.solid.surface_present()).max(initial=0.0))
         if not way < FAR * self.solid.extent:
             raise InputError(
-                f"solids: displacements bring a point {way:.3g} m off at the start, more than {FAR:g} times the "
-                f"largest side of the solids ({self.solid.extent:g} m)"
+                f"solids: a point begins {way:.3g} m from the origin, more than {FAR:g} times the largest side of the "
+                f"solids ({self.solid.extent:g} m): their shape is lost in the round-off of that"
             )
 
     def _check_speed(self, solid: SolidField, fastest: float, dt: float) -> float:

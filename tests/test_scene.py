@@ -767,6 +767,26 @@ def test_a_step_that_shrinks_to_nothing_is_told():
     assert stepping.count(1000) is None
 
 
+@pytest.mark.parametrize("stable, steps", [(np.inf, 1), (3.0, 1), (2.0, 2), (1.0, 3), (0.1, 23), (2.0001 / 0.9, 1)])
+def test_steps_of_auto_end_at_the_end(stable, steps):
+    """Two seconds; the last two steps share what is left."""
+    table = layer('time.dt="auto"', "time.end=2.0", 'time.integrator="symplectic-euler"')
+    stepping = Stepping(scene_from_dict(table).time)
+    t, n, dt = 0.0, 0, 2.0
+    while not stepping.finished(t, dt):
+        dt = stepping.length(t, stable)
+        assert 0.0 < dt <= 0.9 * stable
+        t, n = stepping.after(n + 1, t, dt), n + 1
+    assert t == pytest.approx(2.0, rel=1e-14) and n == steps
+
+
+@pytest.mark.parametrize("stable", [0.0, 1e-20, np.nan])
+def test_a_stable_step_that_is_nothing_is_told(stable):
+    table = layer('time.dt="auto"', "time.end=2.0", 'time.integrator="symplectic-euler"')
+    with pytest.raises(InputError, match=r'time.dt = "auto": the stable step is .* s at t = 0.5; .* 1e-12 of time.end'):
+        Stepping(scene_from_dict(table).time).length(0.5, stable)
+
+
 def test_a_mesh_outside_the_grid_is_refused():
     scene = scene_from_dict(layer())
     check_inside_grid(scene, "solids.bunny.shape", np.array([[0.0, 0.0], [1.0 + 1e-12, 2.0]]))

@@ -22,8 +22,8 @@ UNKNOWN = 1e-6
 class Stepping:
     """The scene's ``time`` at work.
 
-    Steps are taken until the end is reached, or missed by ``SLACK`` of the last one; none is shortened, so the last
-    one may reach beyond.
+    Steps are taken until the end is reached, or missed by ``SLACK`` of the last one; none whose length the scene gives
+    is shortened, so the last one may reach beyond.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Stepping:
         if self._length is not None:
             return self._length
         if self.auto and stable is not None:
-            return PART * stable
+            return self._free_length(t, PART * stable)
         dt = float(self._dt(t=t))
         if dt > (0.0 if self.constant else SHORTEST * self.end):
             self._length = dt if self.constant else None
@@ -63,6 +63,16 @@ class Stepping:
         at = "" if self.constant else f"is {dt:g} at t = {t:g}; "
         wanted = f"must be greater than {SHORTEST:g} of time.end" if dt > 0 else "must be greater than 0 (s)"
         raise ExpressionError(f"time.dt = {self._dt.source!r}", at + wanted)
+
+    def _free_length(self, t: float, longest: float) -> float:
+        """Return the length of a step that may be as long as ``longest``: the last two share what is left."""
+        if not longest > SHORTEST * self.end:
+            at = f"the stable step is {longest / PART:.3g} s at t = {t:g}; nine tenths of it "
+            raise ExpressionError(f'time.dt = "{AUTO}"', f"{at}must be greater than {SHORTEST:g} of time.end")
+        left = self.end - t
+        if left <= longest:
+            return left
+        return min(longest, left / 2)
 
     def after(self, step: int, t: float, dt: float) -> float:
         """Return the time after a step of length dt that began at t and ends as number ``step``, s."""
