@@ -188,6 +188,9 @@ class PressureSolver:
             known.array = b.array_r[self.system.piece(self.fluid.name)]
             self._ksp.setUp()
             self._ksp.getPC().apply(known, guess)
+            space = self.fluid.block.getNullSpace()
+            if space.handle:
+                space.remove(guess)
             pressure = guess.array_r * self.fluid.col_scale
         return self.fluid.round_off(pressure)
 

@@ -37,6 +37,8 @@ SLACK = 10.0
 #: Round-off of the solution may leave this part of the right-hand side; where it is more, K is singular to double
 #: precision, and what is solved for may be anything.
 COARSEST = 1e-4
+#: What round-off of a first guess of the pressure may leave, as a part of the right-hand side.
+COARSEST_PRESSURE = 1e-8
 
 
 def field_prefix(name: str) -> str:
@@ -366,7 +368,7 @@ class Solver:
         rtol, warm = ksp.getTolerances()[0], ksp.getInitialGuessNonzero() and not self.fixed_iterations
         if warm:
             self._drop_coarse_guess(b, x, rtol * size, size)
-        floor = self._floor(b, x)
+        floor = self._floor(b, x, size)
         if not np.isfinite(size + floor):
             raise SolveError(blown_up([field.name for field in system.fields]))
         if ksp.getType() != PETSc.KSP.Type.PREONLY:
@@ -378,7 +380,7 @@ class Solver:
         lost = 0.0
         norms = system.update_residual(x, b)
         if norms[""] > max(rtol * size, floor) and not self.fixed_iterations:
-            floor = self._floor(b, x)  # the first guess may have been nothing
+            floor = self._floor(b, x, size)  # the first guess may have been nothing
             if warm and ksp.getConvergedReason() > 0 and norms[""] > max(rtol * size, floor):
                 # what iterations update drifts from the true residual by round-off: they go on from there
                 iterations += self._run(b, x)
@@ -393,10 +395,15 @@ class Solver:
         if wanted < self.system.round_off_at(x) and not self.system.update_residual(x, b)[""] <= size:
             x.set(0.0)
 
-    def _floor(self, b: PETSc.Vec, x: PETSc.Vec) -> float:
-        """Return what the residual cannot fall below at the pressures in x. Collective."""
+    def _floor(self, b: PETSc.Vec, x: PETSc.Vec, size: float) -> float:
+        """Return what the residual cannot fall below at the pressures in x; ``size`` is that of b. Collective.
+
+        Pressures of a first guess may be anything: their round-off is no more than ``COARSEST_PRESSURE`` of b.
+        """
         floor = self.system.rhs_round_off()
-        return floor if self._pressure is None else max(floor, self._pressure.round_off(b, x))
+        if self._pressure is None:
+            return floor
+        return max(floor, min(self._pressure.round_off(b, x), COARSEST_PRESSURE * size))
 
     def _run(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
         """Run the solver; return its iterations, of the inner one if that takes more. Collective."""
