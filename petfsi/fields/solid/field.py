@@ -474,7 +474,10 @@ class NodalSolid(SolidField):
             If numbers cannot hold it, or what is divided by it.
         """
         if not LIGHTEST < reference_mass < 1 / LIGHTEST:
-            raise InputError(f"a node or cell of {reference_mass:g} kg is too light or too heavy; look at densities")
+            raise InputError(
+                f"a node or cell of {reference_mass:g} kg is too light or too heavy; look at densities, and at the "
+                f"sizes of cells"
+            )
         self._reference_mass = reference_mass
 
     def _mean_diagonal(self, stage: Stage) -> float:
