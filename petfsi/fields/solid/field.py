@@ -242,6 +242,11 @@ class NodalSolid(SolidField):
         """Return w of the step last accepted, flat."""
         return self._integrator.solved(self._motion()).ravel().copy()
 
+    def foreseen(self) -> np.ndarray:
+        """Return w of the step last assembled as supports give it, elsewhere that of the last step, flat."""
+        given = self.fixed_velocity()[self.layout.start : self.layout.end]
+        return np.where(self._is_held[: self._mesh.n_owned].ravel(), given, self.unknown())
+
     def predict(self, time: float, dt: float) -> None:
         """Take the geometry of the step: from here until ``accept`` the surface is where the tangent is taken."""
         motion = self._motion()
