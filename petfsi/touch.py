@@ -37,6 +37,8 @@ THIN = 0.25
 ROOT = 0.5
 #: Where there is no clearance it is looked for again after so many steps.
 WAIT = 10
+#: What is foreseen goes on by so many steps at most.
+AHEAD = 10.0
 #: What there is to do about it.
 WHY = "Nothing pushes bodies off yet, so the run stops where they touch"
 
@@ -173,14 +175,14 @@ class Watch:
     def foresee(self, x: np.ndarray, t: float, dt: float) -> str:
         """Return what would meet, where and when, in a step as ``judge`` has it; nothing if that is no step to take.
 
-        What only touches at the end has met here, too: the way goes on by twice what bodies are drawn in. Farther than
-        all is wide only what has blown up goes. Not collective.
+        What only touches at the end has met here, too: the way goes on by twice what bodies are drawn in, or by
+        ``AHEAD``. Farther than all is wide only what has blown up goes. Not collective.
         """
         way, ends = float(np.abs(x - self._x).max()), np.concatenate((self._x, *self._still))
         if not 0.0 < way < np.ptp(ends, axis=0).max():
             return ""
         drawn = max(float(thing.amount.max()) for thing in self._things[: self._n])
-        beyond = min(1.0, 2.0 * drawn / way)
+        beyond = min(AHEAD, 2.0 * drawn / way)
         x = x + beyond * (x - self._x)
         return self._met(x, t, dt, *self._boxes(x), beyond)
 
@@ -189,7 +191,7 @@ class Watch:
     ) -> str:  # fmt: skip
         """Return what meets first on the way to x, where and when, or what has gone too deep; nothing if none has.
 
-        The way may go on beyond the end of the step, by a part of it; what meets there does so at that end.
+        The way may go on beyond the end of the step, by so many times it; what meets there does so at that end.
         """
         first, said = 2.0, ""
         parts: dict[tuple[int, int], list[Way]] = {}
