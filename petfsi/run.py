@@ -145,9 +145,7 @@ class Run:
         """Take one step; what is wrong with the scene only now has become the step's failure. Collective."""
         simulation = self.simulation
         try:
-            # what overflows is found by those who judge the solve, and told by them
-            with np.errstate(all="ignore"):
-                simulation.advance()
+            simulation.advance()
         except (SolveError, InputError) as error:
             now = simulation.time + simulation.dt
             last = checkpoints.last_good(self.files.checkpoints, self.comm)
@@ -268,6 +266,8 @@ def versions() -> dict[str, str]:
     }
 
 
+# what overflows is found by those who judge a step and what it is made of, and told by them
+@np.errstate(all="ignore")
 def run_scene(
     scene: Scene,
     out: Path,
@@ -297,6 +297,7 @@ def run_scene(
             return run.loop(steps, stop)
 
 
+@np.errstate(all="ignore")
 def resume_run(
     directory: Path, steps: int | None, petsc_args: list[str], wall_limit: float | None, sets: list[str]
 ) -> int:

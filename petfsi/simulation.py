@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build, petsc, start
+from petfsi import build, causes, petsc, start
 from petfsi.accounts import Accounts
 from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
@@ -149,7 +149,7 @@ class Simulation:
     def _take(self, t: float, dt: float, retries: int) -> None:
         """Take a step, or two halves in its place if it fails and so on, at most ``retries`` times. Collective."""
         try:
-            self._attempt(t, dt)
+            self._attempt(t, dt, last=retries == 0)
         except SolveError as error:
             if retries == 0 or isinstance(error, FinalError):
                 raise
@@ -159,25 +159,29 @@ class Simulation:
             self._take(t, dt / 2, retries - 1)
             self._take(t + dt / 2, dt / 2, retries - 1)
 
-    def _attempt(self, t: float, dt: float) -> None:
+    def _attempt(self, t: float, dt: float, last: bool) -> None:
         with self.phase("predict"):
             for field in self.fields:
                 field.predict(t, dt)
             if self.solid and not self.solid.explicit:  # before anything looks for where that is
                 self._check_speed(self.solid, self.solid.predicted() / dt, dt)
+        with causes.touch_named(self.solid, self.watch, t, dt, last):
+            outcome = self._solve(t, dt)
+        with self.phase("accept"):
+            self._accept(t, dt)
+            if not isinstance(self.solver, DiagonalSolver):  # else no step makes any
+                petsc.collect_garbage()
+        self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
+
+    def _solve(self, t: float, dt: float) -> Outcome:
         with self.phase("couple"):
             for coupling in self.couplings:
                 coupling.couple(t, dt)
         with self.phase("assemble"):
             changed = self._assemble(t, dt)
             self._balance(dt)
-        with self.phase("solve"):
-            outcome = self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
-        with self.phase("accept"):
-            self._accept(t, dt)
-            if not isinstance(self.solver, DiagonalSolver):  # else no step makes any
-                petsc.collect_garbage()
-        self.outcome, self.substeps = self.outcome + outcome, self.substeps + 1
+        with self.phase("solve"), causes.elements_named(self.solid):
+            return self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
 
     def _rewind(self) -> None:
         """Put everything back to before the step that has failed; nothing of it was accepted. Collective."""
@@ -206,7 +210,8 @@ class Simulation:
             On all ranks, if that start cannot be found.
         """
         self.rehearse()
-        unread = self.solver.check_options()
+        with causes.elements_named(self.solid):
+            unread = self.solver.check_options()
         self.accounts.start()
         if not resumes:
             self._fit_velocities()

@@ -199,5 +199,6 @@ def blown_up(fields: Sequence[str]) -> str:
     """Return what to say of fields whose equations hold something that is not finite."""
     return (
         f"the state has blown up: the step's equations of {' and '.join(fields)} hold numbers that are not finite, of "
-        f"an element inside out, or beyond 1e154. Smaller steps may help; look at loads, speeds and densities"
+        f"an element inside out, or beyond 1e154. Smaller steps may help; look at loads, supports, speeds, "
+        f"densities, damping, and the sizes of cells and steps"
     )

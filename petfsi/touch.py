@@ -37,6 +37,8 @@ THIN = 0.25
 ROOT = 0.5
 #: Where there is no clearance it is looked for again after so many steps.
 WAIT = 10
+#: What is foreseen goes on by so many steps at most.
+AHEAD = 10.0
 #: What there is to do about it.
 WHY = "Nothing pushes bodies off yet, so the run stops where they touch"
 
@@ -159,9 +161,40 @@ class Watch:
         if self._room > 0.0:
             self._x = x
             return
+        low, high = self._boxes(x)
+        said = self._met(x, t, dt, low, high)
+        if said:
+            raise TouchError(f"{said}. {WHY}")
+        self._x = x
+        self._wait = WAIT if self._wait == 0 else self._wait - 1
+        if self._wait == WAIT:
+            self._room = self._clearance(x, low, high)
+            # of what slides along each other there is none, and it need not be looked for in every step
+            self._wait = 0 if self._room > 0.0 else WAIT
+
+    def foresee(self, x: np.ndarray, t: float, dt: float) -> str:
+        """Return what would meet, where and when, in a step as ``judge`` has it; nothing if that is no step to take.
+
+        What only touches at the end has met here, too: the way goes on by twice what bodies are drawn in, or by
+        ``AHEAD``. Farther than all is wide only what has blown up goes. Not collective.
+        """
+        way, ends = float(np.abs(x - self._x).max()), np.concatenate((self._x, *self._still))
+        if not 0.0 < way < np.ptp(ends, axis=0).max():
+            return ""
+        drawn = max(float(thing.amount.max()) for thing in self._things[: self._n])
+        beyond = min(AHEAD, 2.0 * drawn / way)
+        x = x + beyond * (x - self._x)
+        return self._met(x, t, dt, *self._boxes(x), beyond)
+
+    def _met(
+        self, x: np.ndarray, t: float, dt: float, low: np.ndarray, high: np.ndarray, beyond: float = 0.0
+    ) -> str:  # fmt: skip
+        """Return what meets first on the way to x, where and when, or what has gone too deep; nothing if none has.
+
+        The way may go on beyond the end of the step, by so many times it; what meets there does so at that end.
+        """
         first, said = 2.0, ""
         parts: dict[tuple[int, int], list[Way]] = {}
-        low, high = self._boxes(x)
         for one, other, shift in self._near(low, high):
             b = self._things[other]
             if b.place is None and not any_within(b.points, b.facets, low[one] + shift, high[one] + shift):
@@ -169,17 +202,11 @@ class Watch:
             found = self._meeting(one, other, shift, x, parts)
             if found is not None and found.part < first:
                 first, place = found
-                said = f"{self._verb(one, other)} at {_place(place)}, t = {t + first * dt:.6g} s"
+                when = t + min(first * (1.0 + beyond), 1.0) * dt
+                said = f"{self._verb(one, other)} at {_place(place)}, t = {when:.6g} s"
         if not said:
             said = self._too_deep(x, t + dt)
-        if said:
-            raise TouchError(f"{said}, in the step from {t:.6g} s to {t + dt:.6g} s. {WHY}")
-        self._x = x
-        self._wait = WAIT if self._wait == 0 else self._wait - 1
-        if self._wait == WAIT:
-            self._room = self._clearance(x, low, high)
-            # of what slides along each other there is none, and it need not be looked for in every step
-            self._wait = 0 if self._room > 0.0 else WAIT
+        return f"{said}, in the step from {t:.6g} s to {t + dt:.6g} s" if said else ""
 
     def _verb(self, one: int, other: int) -> str:
         a, b = self._things[one].name, self._things[other].name

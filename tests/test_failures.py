@@ -436,6 +436,59 @@ def test_what_goes_wrong_only_later_is_a_failed_step(scene, here, setting, said)
     has_failed(here("run", scene, "--out", "out", "--set", setting), "out", *said, "There is no checkpoint.")
 
 
+#: What numbers cannot hold, where NumPy would warn before anyone judges: settings, exit code, what is said.
+BEYOND_NUMBERS = {
+    "speed": (["solids.block.initial.velocity=[1e200, 0.0]"], 3, "look at loads, supports, speeds"),
+    "inflow": (["fluid.sides.left.inflow.speed=1e200"], 3, "the flow has blown up: it would cross"),
+    "gravity": (["gravity=[0.0, -1e300]"], 3, "look at loads, supports, speeds"),
+    "support": (['solids.block.supports.0.displacement={ x = "1e300*t" }'], 3, "look at loads, supports, speeds"),
+    "damping": (
+        ["solids.block.damping={ mass = 1e300, stiffness = 1e300 }", 'solids.block.initial.velocity=["y", 0.0]'],
+        3,
+        "densities, damping, and the sizes",
+    ),
+    "step": (["time.dt=1e-301", "time.end=1e-300"], 3, "the sizes of cells and steps"),
+    "size": (
+        ["fluid.size=[3e200, 2e200]", "solids.block.shape.box.size=[1e200, 1e200]", "probes={}"],
+        2,
+        "petfsi: a node or cell of inf kg is too light or too heavy; look at densities, and at the sizes of cells\n",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BEYOND_NUMBERS)
+def test_what_overflows_is_told_of_once_by_those_who_judge(scene, here, name):
+    """Warnings are errors here: one would be taken for a defect."""
+    settings, code, said = BEYOND_NUMBERS[name]
+    words = [word for setting in [*settings, 'time.integrator="bdf2"'] for word in ("--set", setting)]
+    done = here("run", scene, "--out", "out", *words)
+    is_clear(done, said)
+    assert done.returncode == code
+    assert here("check", scene, *words).returncode in (0, 2)
+
+
+@pytest.mark.parametrize(
+    "setting, said",
+    [
+        ('fluid.sides.right={ pressure = "log(-t)" }', "fluid.sides.right.pressure = 'log(-t)': is nan at t = 0.05"),
+        ('gravity=[0.0, "sqrt(-1-t)"]', "gravity.1 = 'sqrt(-1-t)': is nan at t = 0.05"),
+        (
+            'solids.block.loads=[{ where = "top", traction = ["sqrt(-1-t)", 0.0] }]',
+            "solids.block.loads.0.traction.0 = 'sqrt(-1-t)': is nan at t = 0.05",
+        ),
+        (
+            'solids.block.loads=[{ where = "top", pressure = "log(-1-t)" }]',
+            "solids.block.loads.0.pressure = 'log(-1-t)': is nan at t = 0.05",
+        ),
+    ],
+)
+def test_what_has_no_value_in_the_first_step_is_a_mistake(scene, here, setting, said):
+    if "solids" not in setting:
+        scene.write_text(SCENE[: SCENE.index("[solids.block]")])
+    done = here("run", scene, "--out", "out", "--set", setting, "--set", 'time.integrator="bdf2"')
+    is_refused(done, "out", said, "it must be finite")
+
+
 @pytest.mark.parametrize(
     "where, limit, sets, ranks",
     [

@@ -13,7 +13,7 @@ from petfsi.scene.schema import Scene
 # ---- flows that have nowhere to go --------------------------------------------------------------------------
 
 PLUG = {"plug": {"shape": {"box": {"origin": [0.41, -0.1], "size": [0.2, 0.6]}}}}
-#: A wall with a hole from y = .15 to .25, and a block that covers it after .1 s.
+#: A wall with a hole from y = .15 to .25, along which a block slides that covers it after .11 s.
 HOLE = {
     "below": {"shape": {"box": {"origin": [0.5, -0.1], "size": [0.1, 0.25]}}},
     "above": {"shape": {"box": {"origin": [0.5, 0.25], "size": [0.1, 0.25]}}},
@@ -138,7 +138,7 @@ LATER = {
     "piston": (flow({}, {"p": piston(velocity={"x": "where(t<0.025,0,.1)"})}), 3, "solids.p.supports +0.04 m^2/s"),
     "the hole is covered": (
         flow(
-            {"left": jet(0.1), "right": "open"}, {"p": box([0.2, 0.1], [0.2, 0.2], held(velocity={"x": 1.0}))}, HOLE,
+            {"left": jet(0.1), "right": "open"}, {"p": box([0.4, 0.26], [0.1, 0.12], held(velocity={"y": -1.0}))}, HOLE,
             dt=0.02,
         ),
         None,

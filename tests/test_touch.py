@@ -27,7 +27,8 @@ from touch_cases import (
     turning,
 )
 
-from petfsi.errors import TouchError
+from petfsi.balance import Balance
+from petfsi.errors import SolveError, TouchError
 from petfsi.scene.dump import dump_scene
 from petfsi.scene.load import scene_from_dict
 from petfsi.touch import TOUCH
@@ -325,3 +326,94 @@ def test_a_spinning_brick_meets_another_with_an_edge():
     assert what == "solids.two" and when == pytest.approx(
         (np.pi / 4 - np.arccos(0.12 / np.hypot(0.1, 0.1))) / 10, abs=4e-3
     )
+
+
+# ---- in closed boxes, where the step's own equations fail first -------------------------------------------------
+
+#: What a block driven to the right (or around, to the left) at so many m/s meets, where, and when, s.
+POST = {"post": {"shape": box([0.52, 0.45], [0.1, 0.1])}}
+AROUND = {"left": "periodic", "right": "periodic"}
+DRIVEN = {
+    "post": (5.0, 0.2, {"obstacles": POST}, "solids.a enters obstacles.post at (0.52, 0.45) m", 0.044),
+    "at a step's end": (5.0, 0.22, {"obstacles": POST}, "solids.a enters obstacles.post at (0.52, 0.45) m", 0.04),
+    "slowly": (0.05, 0.415, {"obstacles": POST}, "solids.a enters obstacles.post at (0.52, 0.45) m", 0.1),
+    "wall": (5.0, 0.72, {}, "solids.a leaves the fluid's box through fluid.sides.right at (1, 0.4", 0.036),
+    "body": (5.0, 0.2, {"other": box([0.52, 0.45], [0.1, 0.1], [2, 2])}, "solids.a enters solids.other at (0.5", 0.044),
+    "over the seam": (
+        -1.0, 0.05, {"sides": AROUND, "obstacles": {"o": {"shape": box([0.85, 0.42], [0.1, 0.1])}}},
+        "solids.a enters obstacles.o at (0.95, 0.4", 0.1,
+    ),
+}  # fmt: skip
+HELD = [{"where": "all", "fix": ["x", "y"]}]
+
+
+def driven(speed, at, integrator="bdf2", sides=None, obstacles=None, other=None, retries=3):
+    """Return a closed box in which supports move a block along x."""
+    fluid = {"density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [16, 16], "sides": sides or {}}
+    block = solid(box([at, 0.4], [0.1, 0.2], [3, 4]), supports=[HELD[0] | {"velocity": {"x": speed}}])
+    others = {"other": solid(other, supports=HELD)} if other else {}
+    time = {"end": 0.2, "dt": 0.01, "integrator": integrator, "retries": retries}
+    table = {"dim": 2, "time": time, "fluid": fluid, "solids": {"a": block} | others, "obstacles": obstacles or {}}
+    return scene_from_dict(table)
+
+
+def driven_to_its_end(table):
+    """Return what ends a run, and what was reported."""
+    with prepared(table, *LU) as sim:
+        told = []
+        sim.report = told.append
+        with pytest.raises(SolveError) as error:
+            while not sim.finished:
+                sim.advance()
+    return error.value, told
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("name", DRIVEN)
+def test_what_supports_drive_into_something_is_told_of_as_that_and_not_as_what_does_not_balance(name):
+    speed, at, more, what, when = DRIVEN[name]
+    error, told = driven_to_its_end(driven(speed, at, **more))
+    assert isinstance(error, TouchError) and not told
+    assert str(error).startswith(what) and str(error).endswith("so the run stops where they touch")
+    # bodies are drawn in by a hundredth of a cell, and an edge of .05 m by a quarter at most
+    assert when - 1e-9 <= said(error)[1] <= when + min(3 * TOUCH / 16 / abs(speed), 0.001)
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "midpoint"])
+def test_so_it_is_with_other_schemes(integrator):
+    error, _ = driven_to_its_end(driven(5.0, 0.2, integrator, obstacles=POST))
+    assert isinstance(error, TouchError) and said(error) == ("obstacles.post", pytest.approx(0.044, abs=4e-4))
+
+
+def test_what_slows_down_before_a_wall_is_followed_in_shorter_steps():
+    """At 5 m/s a step goes beyond the wall, .03 m ahead; at 1 m/s it meets it .03 s later."""
+    error, told = driven_to_its_end(driven("where(t<0.031,5,1)", 0.72))
+    assert said(error) == ("fluid.sides.right", pytest.approx(0.0527, abs=1e-3))
+    assert told and all("ahead of the step, where its equations are taken, solids.a leaves" in text for text in told)
+    error, told = driven_to_its_end(driven("where(t<0.031,5,1)", 0.72, retries=0))
+    assert str(error).startswith("ahead of the step, where its equations are taken, solids.a leaves the fluid's box")
+    assert not isinstance(error, TouchError) and "shorter steps go on from nearer by" in str(error) and not told
+
+
+def test_a_solve_that_fails_where_bodies_meet_says_so_before_what_the_solver_says(monkeypatch):
+    """Elsewhere the solver alone speaks."""
+    for at, retries in ((0.2, 0), (0.2, 3), (0.1, 3)):
+        with prepared(driven(5.0, at, obstacles=POST, retries=retries), *LU) as sim:
+            for _ in range(4):
+                sim.advance()
+            monkeypatch.setattr(sim.solver, "solve", fails)
+            monkeypatch.setattr(Balance, "fault", lambda *_: None)
+            with pytest.raises(SolveError) as error:
+                sim.advance()
+            monkeypatch.undo()
+        text = str(error.value)
+        if retries == 0:
+            assert said(error.value) == ("obstacles.post", pytest.approx(0.044, abs=2e-4))
+            assert text.endswith("the run stops where they touch. The step failed of it: the solver gave up")
+        else:
+            # of shorter steps the first one ends before the touch
+            assert text == "the solver gave up"
+
+
+def fails(*_):
+    raise SolveError("the solver gave up")

@@ -388,9 +388,20 @@ class SolidField(Field):
         """
         return
 
+    def inside_out(self) -> str:
+        """Return which body has an element inside out where equations were last taken that it does not stand.
+
+        Nothing if none has. Collective.
+        """
+        return ""
+
     def remark(self, dt: float) -> str | None:
         """Return what a user should know of the step of dt last accepted, each thing once. Collective."""
         return None
+
+    @abstractmethod
+    def foreseen(self) -> np.ndarray:
+        """Return the solution (SI) of the step last assembled as supports give it, elsewhere that of the last step."""
 
     @abstractmethod
     def predicted(self) -> float:

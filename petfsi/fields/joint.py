@@ -186,6 +186,14 @@ class JointSolid(SolidField):
         for part, mine in self._split(x):
             part.judge(mine, dt)
 
+    def inside_out(self) -> str:
+        """Return which body of any part has an element inside out. Collective."""
+        return "; ".join(filter(None, [part.inside_out() for part in self.parts]))
+
+    def foreseen(self) -> np.ndarray:
+        """Return the solution of all parts as known before the solve."""
+        return np.concatenate([part.foreseen() for part in self.parts])
+
     def remark(self, dt: float) -> str | None:
         """Return what the parts remark. Collective."""
         found = [text for text in [part.remark(dt) for part in self.parts] if text]

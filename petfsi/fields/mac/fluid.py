@@ -79,7 +79,7 @@ class MacFluid(CoveredGrid):
         self._bands = [Band(grid, axis) for axis in self._axes]
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
-        self._gravity = [Expression(g, ("t",), key="gravity") for g in gravity]
+        self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(gravity)]
         # the ray transfer stays as it was published
         exact = scene.transfer == "cutcell" and scene.gravity is not None
         self.weight = Weight(grid, self.density, self._gravity) if exact else None
@@ -327,9 +327,17 @@ class MacFluid(CoveredGrid):
         return found
 
     def rehearse(self, time: float, dt: float) -> None:
-        """Give jets the velocities that they have in a step from ``time``. Collective."""
-        self.surroundings.evaluate(time + self._transport.moment(dt))
+        """Give jets the velocities that they have in a step from ``time``; see that what else drives has values.
+
+        Collective.
+        """
+        moment = time + self._transport.moment(dt)
+        self.surroundings.evaluate(moment)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
+        if dt > 0.0:
+            self.open_sides.check(moment)
+            for gravity in self._gravity:
+                gravity(t=moment)
 
     def place(self, member: np.ndarray) -> str:
         """Return the box around the cells of some unknowns. Collective."""

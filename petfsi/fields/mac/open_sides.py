@@ -67,9 +67,13 @@ class Given:
         """That of a velocity along the axis that goes into the grid."""
         return -1.0 if self.upper else 1.0
 
+    def at(self, time: float) -> np.ndarray:
+        """Return what the scene gives at a time, Pa, shape (n,)."""
+        return evaluate_at(self._expression, self.points, time)
+
     def evaluate(self, time: float, weight: np.ndarray, corners: np.ndarray) -> None:
         """Set the pressure for a time, with rho g of that and the corners of the grid."""
-        p = evaluate_at(self._expression, self.points, time)
+        p = self.at(time)
         if self.spec.hydrostatic:
             level = self.spec.level
             top = -float((corners @ weight).min()) if level is None else level * float(np.linalg.norm(weight))
@@ -144,6 +148,17 @@ class OpenSides:
     def _evaluate_here(self, time: float, weight: np.ndarray) -> None:
         for side in self.given:
             side.evaluate(time, weight, self._corners)
+
+    def check(self, time: float) -> None:
+        """Raise if a given pressure has no value at a time. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks.
+        """
+        if self.any:
+            agreed(self.grid.comm, lambda: [side.at(time) for side in self.given])
 
     def on(self, axis: int, upper: bool) -> Given | None:
         """Return one of them."""

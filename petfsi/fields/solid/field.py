@@ -242,6 +242,11 @@ class NodalSolid(SolidField):
         """Return w of the step last accepted, flat."""
         return self._integrator.solved(self._motion()).ravel().copy()
 
+    def foreseen(self) -> np.ndarray:
+        """Return w of the step last assembled as supports give it, elsewhere that of the last step, flat."""
+        given = self.fixed_velocity()[self.layout.start : self.layout.end]
+        return np.where(self._is_held[: self._mesh.n_owned].ravel(), given, self.unknown())
+
     def predict(self, time: float, dt: float) -> None:
         """Take the geometry of the step: from here until ``accept`` the surface is where the tangent is taken."""
         motion = self._motion()
@@ -474,7 +479,10 @@ class NodalSolid(SolidField):
             If numbers cannot hold it, or what is divided by it.
         """
         if not LIGHTEST < reference_mass < 1 / LIGHTEST:
-            raise InputError(f"a node or cell of {reference_mass:g} kg is too light or too heavy; look at densities")
+            raise InputError(
+                f"a node or cell of {reference_mass:g} kg is too light or too heavy; look at densities, and at the "
+                f"sizes of cells"
+            )
         self._reference_mass = reference_mass
 
     def _mean_diagonal(self, stage: Stage) -> float:

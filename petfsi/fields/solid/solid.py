@@ -190,16 +190,31 @@ class SimplexSolid(NodalSolid):
 
         Explicit steps are not judged: what they do to an element takes many of them, and shows in the stable step.
         """
-        if self.explicit or not np.any(self._must_not_invert):
-            return
-        there = self._arrival(x, dt).displacement
-        least = np.where(self._must_not_invert, self._smallest_ratios(there), np.inf)
-        if np.min(least) <= 0:
-            name = self.names[int(np.argmin(least))]
-            raise SolveError(
-                f"solids.{name} has turned an element inside out: det F = {np.min(least):.1e}. What comes of that is "
-                f'no motion of its material; smaller steps, more damping, or material = "stable-neohookean"'
-            )
+        if self._may_be_refused:
+            said = self._inverted(self._arrival(x, dt).displacement)
+            if said:
+                raise SolveError(said)
+
+    def inside_out(self) -> str:
+        """Return which body has an element inside out where equations were last taken. Collective."""
+        if not self._may_be_refused:
+            return ""
+        return self._inverted(self.displacement if self._stage is None else self._stage.tangent_at)
+
+    @property
+    def _may_be_refused(self) -> bool:
+        return not self.explicit and bool(np.any(self._must_not_invert))
+
+    def _inverted(self, displacement: np.ndarray) -> str:
+        """Return which body has an element inside out there, of a material not made for it. Collective."""
+        least = np.where(self._must_not_invert, self._smallest_ratios(displacement), np.inf)
+        if not np.min(least) <= 0:
+            return ""
+        name = self.names[int(np.argmin(least))]
+        return (
+            f"solids.{name} has turned an element inside out: det F = {np.min(least):.1e}. What comes of that is "
+            f'no motion of its material; smaller steps, more damping, or material = "stable-neohookean"'
+        )
 
     def _smallest_ratios(self, displacement: np.ndarray) -> np.ndarray:
         """Return the smallest det F of each body on any rank. Collective."""

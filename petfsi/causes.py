@@ -1,0 +1,63 @@
+"""What a step failed of, beyond what its solver can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from petfsi.errors import FinalError, NoSolutionError, SolveError, TouchError
+from petfsi.fields.base import SolidField
+from petfsi.touch import WHY, Watch
+
+
+@contextmanager
+def touch_named(solid: SolidField | None, watch: Watch | None, t: float, dt: float, last: bool) -> Iterator[None]:
+    """Say that bodies meet if the step whose equations fail inside would bring them there. Collective.
+
+    The fluid's interface goes ahead of the step's solution. Where that leads a body into something the equations are
+    those of no fluid: what supports sweep does not balance, or nothing converges.
+
+    Parameters
+    ----------
+    solid : SolidField or None
+    watch : Watch or None
+    t, dt : float
+        When the step began, and its length, s.
+    last : bool
+        Whether no shorter steps will be tried.
+
+    Raises
+    ------
+    TouchError
+        If they meet on the way that supports and the last velocities foresee.
+    SolveError
+        If what does not balance is due to where the step's equations are taken, which that way does not reach.
+    """
+    try:
+        yield
+    except SolveError as error:
+        if solid is None or watch is None or not (last or isinstance(error, FinalError)):
+            raise
+        unbalanced = isinstance(error, NoSolutionError)
+        said = watch.foresee(solid.surface_arrival(solid.foreseen(), dt), t, dt)
+        if said:
+            # what does not balance is a consequence, and what it advises no help
+            words = "" if unbalanced else f". The step failed of it: {error}"
+            raise TouchError(f"{said}. {WHY}{words}") from error
+        said = watch.foresee(solid.surface_positions(), t, dt) if unbalanced else ""
+        if said:
+            where = f"ahead of the step, where its equations are taken, {said}"
+            raise SolveError(f"{where}: shorter steps go on from nearer by") from error
+        raise
+
+
+@contextmanager
+def elements_named(solid: SolidField | None) -> Iterator[None]:
+    """Name the body that has an element inside out where equations were taken of which a solve fails. Collective."""
+    try:
+        yield
+    except SolveError as error:
+        said = solid.inside_out() if solid is not None else ""
+        if not said:
+            raise
+        raise SolveError(f"{said}: {error}") from error
