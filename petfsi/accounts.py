@@ -16,6 +16,8 @@ from petfsi.scene.schema import Scene
 
 #: The columns that are summed over steps.
 SUMMED = ("potential", "dissipated", "load_work", "boundary_work")
+#: Those of them by which something beyond the scene's matter gives and takes.
+EXCHANGED = [0, 2, 3]
 
 
 class Accounts:
@@ -73,6 +75,9 @@ class Accounts:
         Empty before ``start``.
     values : dict of str to float
         The present row.
+    exchanged : float
+        What there was at the start, and what gravity, loads and boundaries did since, each step's of each without its
+        sign, J.
     """
 
     def __init__(
@@ -83,7 +88,7 @@ class Accounts:
         self.dim, self._wanted, self._heavy = scene.dim, scene.output.accounts, scene.gravity is not None
         self._elastic = any(field.elastic for field in fields)
         self._loaded = any(solid.loads or solid.body_force for solid in scene.solids.values())
-        self._initial = 0.0
+        self._initial, self.exchanged = 0.0, 0.0
         self._sums = np.zeros(4)
         integrator = INTEGRATORS[scene.time.integrator]()
         self._solid = ForceWork(next((f for f in fields if isinstance(f, SolidField)), None), couplings, integrator)
@@ -104,7 +109,7 @@ class Accounts:
             self._enter(np.zeros(8), 0.0)
             self._power = None
             self._solid.start()
-            self._initial = self.values["energy_residual"]
+            self._initial = self.exchanged = self.values["energy_residual"]
             self.values["energy_residual"] = 0.0
 
     def update(self, pressure: np.ndarray | None, dt: float) -> None:
@@ -134,7 +139,9 @@ class Accounts:
         self.comm.Allreduce(share, total)
         power = total[4:8]
         before = power if self._power is None or self._centred else self._power
-        self._sums += total[:4] + dt / 2 * (before + power)
+        step = total[:4] + dt / 2 * (before + power)
+        self._sums += step
+        self.exchanged += float(np.abs(step[EXCHANGED]).sum())
         self._power = power
         n = len(stocks)
         kinetic, elastic = total[8 : 8 + 2 * n].reshape(n, 2).sum(axis=0).tolist()
@@ -163,6 +170,7 @@ class Accounts:
         """Return the present row, where it began, and what the next one reads. Collective."""
         power = self._power
         numbers = self.values | {"initial_energy": self._initial, "began": float(power is not None)}
+        numbers["exchanged"] = self.exchanged
         if power is not None:
             numbers |= {f"power_{name}": value for name, value in zip(SUMMED, power.tolist(), strict=True)}
         return {name: scalar_slab(self.comm, value) for name, value in numbers.items()} | self._solid.state()
@@ -174,7 +182,7 @@ class Accounts:
             return float(read(name, (0,), (1,))[0])
 
         self.values = {name: number(name) for name in self.values}
-        self._initial = number("initial_energy")
+        self._initial, self.exchanged = number("initial_energy"), number("exchanged")
         self._sums[:] = [self.values.get(name, 0.0) for name in SUMMED]
         began = number("began") > 0
         self._power = np.array([number(f"power_{name}") for name in SUMMED]) if began else None

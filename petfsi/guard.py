@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from mpi4py import MPI
 
+from petfsi.accounts import Accounts
 from petfsi.errors import SolveError
 from petfsi.fields.base import Reader, Slab, scalar_slab
+from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
-#: Energies below this part of the weight of all water times the height of its box are round-off.
+#: Energies below this part of the weight of all water times the height of its box, or of all exchanged, are round-off.
 ROUND_OFF = 1e-9
 #: In so many steps running: of what begins at rest the first ones have little to compare with.
 PATIENCE = 3
 
 
 class EnergyGuard:
-    """Compares the energy that nothing accounts for with what a run has held or was given.
+    """Compares the energy that a run holds with what it can have got.
 
-    With E = kinetic + elastic energy and what damping took so far, and R = ``energy_residual``, see ``accounts``, E - R
-    is what a run began with and what gravity, loads, supports and sides have done to it since. Once R exceeds
-    ``time.energy_limit`` times the largest E - R so far, ``PATIENCE`` times running, the motion is the scheme's own. A
-    scheme's damping makes R negative, and that is never judged.
+    It holds kinetic + elastic energy and what damping took so far. It can have got ``Accounts.exchanged``: what it
+    began with and what gravity, loads, supports and sides did since, each step's without its sign. Once it holds more
+    than (1 + ``time.energy_limit``) times that, ``PATIENCE`` times running, the motion is the scheme's own.
+
+    ``energy_residual`` would not do: it is first order in the mesh where fluid streams through, adds up, and also pays
+    for what has left.
 
     Without the accounts there is nothing to judge, nor in statics, where no step goes on from the energy of the last.
 
@@ -34,26 +36,32 @@ class EnergyGuard:
 
     Attributes
     ----------
-    watches : bool
-    largest : float
-        The largest E - R so far, J.
     beyond : int
         How many of the last steps had too much.
+    weight : float
+        The largest weight so far of all that the fluid's box may hold, times the longest way it may fall, J (per m in
+        2D): fluid at rest in a closed box exchanges nothing, and round-off moves it.
+    notes : list of str
+        That nothing is judged where the scene itself sets a limit, but keeps no accounts.
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene) -> None:
         self.comm, self.limit = comm, scene.time.energy_limit
-        self.watches = watches(scene)
-        self.largest, self.beyond = 0.0, 0
-        self._floor = ROUND_OFF * _weight(scene)
+        self._watches = self.limit >= 0 and not unjudged(scene)
+        asked = self.limit >= 0 and "energy_limit" in scene.time.model_fields_set
+        self.notes = [] if scene.output.accounts or not asked else [f"time.energy_limit: {unjudged(scene)}"]
+        self._gravity, self._mass_way = _may_fall(scene)
+        self.beyond, self.weight = 0, 0.0
 
-    def judge(self, values: Mapping[str, float], advice: str) -> None:
-        """Raise if the step that these accounts close with has energy out of nothing. Not collective; all agree.
+    def judge(self, accounts: Accounts, time: float, advice: str) -> None:
+        """Raise if there is energy out of nothing. Not collective; all agree.
 
         Parameters
         ----------
-        values : mapping of str to float
-            ``Accounts.values``.
+        accounts : Accounts
+            Of the step that ends now.
+        time : float
+            At its end, s.
         advice : str
             What may help.
 
@@ -61,43 +69,45 @@ class EnergyGuard:
         ------
         SolveError
         """
-        if not values:
+        if not accounts.values:
             return
-        residual = values["energy_residual"]
-        parts = {name: values.get(name, 0.0) for name in ("kinetic", "elastic", "dissipated")}
-        held = sum(parts.values()) - residual
-        self.largest = max(self.largest, held)
-        self.beyond = 0 if residual <= self.limit * max(self.largest, self._floor) else self.beyond + 1
-        if not self.watches or self.beyond < PATIENCE:
+        self.weight = max(self.weight, self._mass_way * float(np.linalg.norm([g(t=time) for g in self._gravity])))
+        parts = {name: accounts.values.get(name, 0.0) for name in ("kinetic", "elastic", "dissipated")}
+        held, got = sum(parts.values()), accounts.exchanged
+        most = (1.0 + self.limit) * got + ROUND_OFF * (got + self.weight)
+        self.beyond = 0 if held <= most else self.beyond + 1
+        if not self._watches or self.beyond < PATIENCE:
             return
         grown = max(parts, key=lambda name: parts[name])
         raise SolveError(
-            f"energy has come out of nothing, most of it {grown}: {residual:.3g} J of now "
-            f"{', '.join(f'{name} {value:.3g} J' for name, value in parts.items())}; what the run began with and was "
-            f"given since was never more than {self.largest:.3g} J. {advice} time.energy_limit = {self.limit:g} is the "
-            f"part of that which may be so; -1 lets all pass."
+            f"energy has come out of nothing, most of it {grown}: there are now "
+            f"{', '.join(f'{name} {value:.3g} J' for name, value in parts.items())}; what it began with and what "
+            f"gravity, loads and boundaries gave or took since, step by step, come to {got:.3g} J. {advice} "
+            f"time.energy_limit = {self.limit:g} is how much more there may be, as a part of that; -1 lets all pass."
         )
 
     def state(self) -> dict[str, Slab]:
-        """Return what the next step is judged by."""
-        numbers = {"largest": self.largest, "beyond": self.beyond}
+        """Return what the next step is judged by, besides the accounts."""
+        numbers = {"weight": self.weight, "beyond": self.beyond}
         return {name: scalar_slab(self.comm, value) for name, value in numbers.items()}
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
-        self.largest, beyond = (float(read(name, (0,), (1,))[0]) for name in ("largest", "beyond"))
+        self.weight, beyond = (float(read(name, (0,), (1,))[0]) for name in ("weight", "beyond"))
         self.beyond = int(beyond)
 
 
-def watches(scene: Scene) -> bool:
-    """Return whether the energy of a scene is judged."""
-    return scene.time.energy_limit >= 0 and scene.output.accounts and scene.time.integrator != "static"
+def unjudged(scene: Scene) -> str:
+    """Return why the energy of a scene cannot be judged, or nothing."""
+    if not scene.output.accounts:
+        return "output.accounts is false"
+    return "the integrator is static" if scene.time.integrator == "static" else ""
 
 
-def _weight(scene: Scene) -> float:
-    """Return the weight of all that the fluid's box may hold, times the longest way it may fall, J (per m in 2D)."""
-    if scene.fluid is None or scene.gravity is None:
-        return 0.0
-    gravity = [abs(g) for g in scene.gravity if not isinstance(g, str)]
+def _may_fall(scene: Scene) -> tuple[list[Expression], float]:
+    """Return gravity, and the mass of all that the fluid's box may hold times its longest side, kg m (per m in 2D)."""
+    if scene.fluid is None:
+        return [], 0.0
     size = np.asarray(scene.fluid.size)
-    return scene.fluid.density * float(np.linalg.norm(gravity) * size.max() * size.prod())
+    mass = scene.fluid.density * float(size.prod())
+    return [Expression(g, ("t",), "gravity") for g in scene.gravity or []], mass * float(size.max())

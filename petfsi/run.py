@@ -336,7 +336,7 @@ def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
-    told = [part.notes for part in (simulation.fluid, simulation.watch) if part is not None]
+    told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
     for note in [*chain.from_iterable(told), *simulation.notes]:
         console.note(note)
     for name in unread:

@@ -136,7 +136,7 @@ class Simulation:
         self.substeps, self.outcome, self.volume_error = 0, Outcome(0, 0.0), 0.0
         for begin, length in self.stable.parts(t, dt):
             self._take(begin, length, self._retries)
-        self.guard.judge(self.accounts.values, self._advice())
+        self.guard.judge(self.accounts, t + dt, self._advice())
         self.step += 1
         self.time = self._stepping.after(self.step, t, dt)
 

@@ -97,6 +97,27 @@ def test_a_jet_that_ends_at_a_sheet_within_a_cell_stays_on_its_side(height):
         assert np.all(fluid.smoke[fluid.grid.owned(None)][:, y < height - 1 / 16] == 0.0)
 
 
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("transfer", ["cutcell", "ray"])
+def test_an_inflow_says_what_obstacles_leave_of_it(transfer):
+    """Cut cells: the exact part. Ray: whole cells."""
+
+    def notes(low, high, side):
+        jet = {"speed": "t", "region": box([-1.0, 0.25], [3.0, 0.25])["shape"]}
+        sides = {"left": "open", "right": "open"} | {side: {"inflow": jet}}
+        more = {"obstacles": {"block": box([-0.2, low], [1.4, high - low])}, "coupling": {"transfer": transfer}}
+        with running(scene((8, 20), sides, **more)) as sim:
+            return sim.fluid.notes
+
+    for side in ("left", "right"):
+        left = 0.11 if transfer == "cutcell" else 0.1
+        said = f"fluid.sides.{side}.inflow: obstacles leave {left} of its 0.25 m open; what comes in is as much less"
+        assert notes(0.1, 0.39, side) == [said]
+        assert notes(0.6, 0.9, side) == []
+        with pytest.raises(InputError, match=f"fluid.sides.{side}.inflow: obstacles cover all of it"):
+            notes(0.1, 0.6, side)
+
+
 @pytest.mark.parallel([1, 2])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("cells", [(14, 12), (12, 7, 6)])

@@ -163,8 +163,8 @@ def _box(dt: float, scheme: str, transfer: str, disk: dict[str, Any]) -> Scene:
 
 
 def _created(sim: Simulation) -> float:
-    """Return the energy out of nothing so far over the most that was there, or nothing if it is less than nothing."""
-    return max(0.0, sim.accounts.values["energy_residual"]) / max(sim.guard.largest, float(np.finfo(float).tiny))
+    """Return the energy out of nothing so far over all that was exchanged, or nothing if it is less than nothing."""
+    return max(0.0, sim.accounts.values["energy_residual"]) / max(sim.accounts.exchanged, float(np.finfo(float).tiny))
 
 
 def _mass(sim: Simulation, density: float) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
+from petfsi.errors import InputError
 from petfsi.fields.base import Reader, Slab, Stock, Work, scalar_slab
 from petfsi.fields.mac import advect, budget, kinds, pressure, views
 from petfsi.fields.mac.covered import CoveredGrid
@@ -30,6 +31,9 @@ from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.cutgrid import Openings
+
+#: Less than this part of a jet's area is lost to round-off.
+ROUND_OFF = 1e-9
 
 
 class MacFluid(CoveredGrid):
@@ -85,6 +89,27 @@ class MacFluid(CoveredGrid):
         self.weight = Weight(grid, self.density, self._gravity) if exact else None
         self._uncover()
         self._start()
+        self._notes = side_notes(scene) + self._look_at_jets()
+
+    def _look_at_jets(self) -> list[str]:
+        """Refuse jets that obstacles cover altogether; return notes of those that they cover in part. Collective."""
+        around = self.surroundings
+        if not around.has_jets or not self.scene.obstacles:
+            return []
+        for jet in around.jets:
+            jet.open_fully()
+        opened = {key: float(flow.sum()) for key, flow in self.inflows().items()}
+        around.evaluate(0.0)
+        whole = [sum(jet.area(self.grid) for jet in around.jets if jet.key == key) for key in opened]
+        areas = self.comm.allreduce(np.array([list(opened.values()), whole]))
+        notes, unit = [], "m^2" if self.dim == 3 else "m"
+        for key, (left, area) in zip(opened, areas.T, strict=True):
+            if left <= ROUND_OFF * area:
+                raise InputError(f"{key}: obstacles cover all of it, and nothing comes in; move them, or its region")
+            if left < (1.0 - ROUND_OFF) * area:
+                so_much = f"{left:.4g} of its {area:.4g} {unit}"
+                notes.append(f"{key}: obstacles leave {so_much} open; what comes in is as much less")
+        return notes
 
     def _start(self) -> None:
         """Set velocity and smoke as the scene says for time zero. Collective."""
@@ -469,7 +494,7 @@ class MacFluid(CoveredGrid):
     @property
     def notes(self) -> list[str]:
         """What a user should know of the sides."""
-        return side_notes(self.scene)
+        return self._notes
 
     def cfl(self, dt: float) -> float:
         """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""

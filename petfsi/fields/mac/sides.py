@@ -129,6 +129,16 @@ class Jet:
         for along in self._along:
             self.squares += evaluate_at(along, self.points, time) ** 2
 
+    def open_fully(self) -> None:
+        """Set ``value`` to what a speed of 1 m/s everywhere would make it."""
+        self._rate[:] = -1.0 if self.upper else 1.0
+
+    def area(self, grid: MacGrid) -> float:
+        """Return the area of its parts of faces beside this rank's own cells, m^2 (m in 2D)."""
+        cells = [i - self.upper if b == self.axis else i for b, i in enumerate(self.faces)]
+        own = [(i >= s.start) & (i < s.stop) for i, s in zip(cells, grid.owned(None), strict=True)]
+        return float(self.part[np.all(own, axis=0)].sum() * grid.face_area(self.axis))
+
     def fill_behind(self, cells: np.ndarray, value: float | bool) -> None:
         """Give the ghosts behind the jet a value."""
         across = tuple(f for b, f in enumerate(self.faces) if b != self.axis)
