@@ -106,6 +106,24 @@ def test_a_stiff_beam_moves_on_with_its_clamp(integrator, theory):
     kept(beam(theory, [clamp | {"velocity": {"y": SPEED}}], integrator), 0.5 * RHO * 0.1 * SPEED**2, rel=1e-4)
 
 
+@pytest.mark.parallel([1, 2])
+def test_bodies_of_several_kinds_move_on_each_with_its_own_support():
+    """And a third one, that nothing pushes, stays."""
+    shape = {"start": [0.0, 2.0], "end": [1.0, 2.0], "thickness": 0.1, "elements": 6}
+    body = {"density": RHO, "young": STIFF, "poisson": 0.3}
+    still, block_ = ({"box": {"origin": [x, 0.0], "size": [1.0, 0.5], "cells": [3, 2]}} for x in (2.0, 0.0))
+    clamp = [{"where": "start", "fix": ["x", "y", "angle"], "velocity": {"y": SPEED}}]
+    solids = {
+        "beam": body | {"shape": {"beam": shape}, "supports": clamp},
+        "block": body | {"shape": block_, "supports": pushed(2, x=2 * SPEED)},
+        "still": body | {"shape": still},
+    }
+    data = {"dim": 2, "time": {"end": 1.0, "dt": DT, "integrator": "bdf2"}, "solids": solids}
+    with prepared(scene_from_dict(data), comm=COMM) as sim:
+        momentum = [sim.accounts.values[f"momentum.{axis}"] for axis in "xy"]
+    assert np.allclose(momentum, [RHO * 0.5 * 2 * SPEED, RHO * 0.1 * SPEED], rtol=1e-4, atol=0.0)
+
+
 def test_a_thrown_body_stops_at_once_where_it_is_clamped():
     """It is the same jump: as given the first step had 1e11 J."""
     with prepared(box(2, pushed(2), "bdf2", velocity=[1.0, 0.0])) as sim:
