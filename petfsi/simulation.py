@@ -228,17 +228,21 @@ class Simulation:
             self._check_equations()
 
     def _fit_velocities(self) -> None:
-        """Let fluid and solids begin with velocities that fit each other; note what that did. Collective."""
-        if self.regions is None or not isinstance(self.fluid, PressureFluid) or not isinstance(self.solver, Solver):
+        """Let supports, solids and fluid begin with velocities that fit each other; note what that did. Collective."""
+        if not isinstance(self.solver, Solver):
             return
+        fluid = self.fluid if isinstance(self.fluid, PressureFluid) else None
         before = self.accounts.values.get("kinetic", np.nan)
-        if not start.fit_velocities(self.system, self.solver, self.regions, self.fluid, self.solid, self.dt):
+        changed = start.fit_velocities(self.system, self.solver, self.regions, fluid, self.solid, self.dt)
+        if not changed:
             return
         self.accounts.start()
         after = self.accounts.values.get("kinetic", np.nan)
         if abs(after - before) > START_NOTED * max(before, after):
+            what = {start.SUPPORTS: "those of supports", start.FLUID: "each other"}
+            misfit = ", nor ".join(what[reason] for reason in changed)
             self.notes.append(
-                f"the velocities given at t = 0 did not fit each other, and were brought to the nearest that do: "
+                f"the velocities given at t = 0 did not fit {misfit}, and were brought to the nearest that do: "
                 f"kinetic energy {after:.4g} J, not {before:.4g} J"
             )
 

@@ -1,4 +1,4 @@
-"""A checkpoint holds all that the next step reads: runs that go on repeat, bit for bit, those never stopped.
+"""A checkpoint holds all that the next step reads: runs that go on repeat, bit for bit, those that wrote it as well.
 
 In one process, so that every integrator, solver and kind of solid can be had; through the command: ``test_run``.
 """
@@ -10,6 +10,7 @@ import pytest
 from step_cases import SWING, block, loaded, prepared, stored
 
 from petfsi.integrators import INTEGRATORS
+from petfsi.scene.load import scene_from_dict
 from petfsi.scene.schema import Scene
 
 SCENES = Path(__file__).parent / "scenes"
@@ -108,3 +109,54 @@ def test_an_explicit_solid_alone_may_stop_anywhere(before):
     with prepared(scene) as sim:
         at_rest = sim.stable.limit
     assert goes_on(scene, forgets=False, before=before, after=20).stable.limit != at_rest
+
+
+def _water(size, cells, **more):
+    return {"density": 1000.0, "origin": [0.0, 0.0], "size": size, "cells": cells} | more
+
+
+def _bar(origin, size, cells, **more):
+    shape = {"box": {"origin": origin, "size": size, "cells": cells}}
+    return {"shape": shape, "density": 1000.0, "young": 1e8, "poisson": 0.0} | more
+
+
+def _held(*where):
+    return [{"where": side, "fix": ["x", "y"]} for side in where]
+
+
+#: By name the integrator, dt, the fluid and the solid.
+KINDS = {
+    "a pressure side": (
+        "bdf2", 0.01, _water([2.0, 1.0], [24, 12], sides={"left": {"pressure": 500.0}, "right": "open"}),
+        _bar([0.71, 0.0], [0.3, 1.0], [3, 8], body_force=["100*sin(10*t)", 0.0]),
+    ),
+    "a jet past a sheet": (
+        "bdf2", 0.01,
+        _water([1.0, 1.0], [16, 16], sides={
+            "left": {"inflow": {"speed": 1.0, "region": {"box": {"origin": [-1, 0.21], "size": [2, 0.37]}}}},
+            "right": "open",
+        }),
+        _bar([0.0, 0.4], [1.0, 0.01], [20, 1], supports=_held("left", "right", "top")),
+    ),
+    "sub-steps in a light fluid": (
+        "symplectic-euler", 0.02,
+        _water([2.0, 1.0], [24, 12], density=1.0, sides=dict.fromkeys(["left", "right", "bottom", "top"], "open")),
+        _bar([0.25, 0.5], [1.0, 0.25], [8, 2], density=10.0, young=1e4, material="linear",
+             supports=_held("left"), initial={"velocity": ["0.1*sin(pi*(x-0.25)/2)", 0.0]}),
+    ),
+    "sub-steps under particles": (
+        "symplectic-euler", 2e-3,
+        {"kind": "sph", "density": 1000.0, "origin": [0.0, 0.0], "size": [0.6, 0.5], "spacing": 0.05,
+         "sound_speed": 20.0, "fill": [{"box": {"origin": [0.0, 0.1], "size": [0.6, 0.2]}}], "sides": {"top": "open"}},
+        _bar([0.0, 0.0], [0.6, 0.1], [12, 2], young=1e6, supports=_held("bottom", "left", "right")),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_what_else_a_step_may_read(name):
+    integrator, dt, fluid, solid = KINDS[name]
+    time = {"integrator": integrator, "dt": dt, "end": 1.0, "above_limit": "subcycle"}
+    gravity = [0.0, -9.81 if "particles" in name else 0.0]
+    scene = scene_from_dict({"dim": 2, "gravity": gravity, "time": time, "fluid": fluid, "solids": {"bar": solid}})
+    goes_on(scene, before=3, after=2)

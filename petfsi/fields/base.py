@@ -478,6 +478,15 @@ class SolidField(Field):
         """
 
     @abstractmethod
+    def jolt(self) -> np.ndarray | None:
+        """Return what supports do to free unknowns that set off otherwise than the velocities given at the start.
+
+        A right-hand side (SI, zero at held unknowns) to the step as assembled before it began, whose solution is what
+        that changes at once; None, on all ranks, where supports and velocities agree, or where the step is explicit
+        or has no inertia.
+        """
+
+    @abstractmethod
     def push(self, change: np.ndarray) -> None:
         """Change the present velocities by this much (SI, by unknown)."""
 

@@ -153,6 +153,14 @@ class JointSolid(SolidField):
             part.accept(mine, time, dt)
         self.moved = np.concatenate([part.moved for part in self.parts])
 
+    def jolt(self) -> np.ndarray | None:
+        """Return what supports do to the free unknowns of every part at the start."""
+        every = [part.jolt() for part in self.parts]
+        if all(pull is None for pull in every):
+            return None
+        none = [np.zeros(part.layout.n_local) for part in self.parts]
+        return np.concatenate([zero if pull is None else pull for pull, zero in zip(every, none, strict=True)])
+
     def push(self, change: np.ndarray) -> None:
         """Change the velocities of every part by its share."""
         for part, mine in self._split(change):

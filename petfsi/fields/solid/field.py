@@ -165,7 +165,8 @@ class NodalSolid(SolidField):
         moved = {name: ("displacement", start.displacement) for name, start in initial.items()}
         thrown = {name: ("velocity", start.velocity) for name, start in initial.items()}
         self.displacement = _evaluate(moved, mesh.points, self._node_body, self.width)[mine]
-        self.velocity = _evaluate(thrown, mesh.points, self._node_body, self.width)[mine]
+        velocity = _evaluate(thrown, mesh.points, self._node_body, self.width)
+        self.velocity = velocity[mine]
         self.moved = np.zeros(self.layout.n_local)
         self._stage: Stage | None = None
         self._geometry: np.ndarray | None = None
@@ -174,6 +175,9 @@ class NodalSolid(SolidField):
         self._past_dt = 0.0
         self._prescribed = self._supports.initial_velocities(dt)
         held = self._supports.unknowns
+        given = np.empty_like(velocity)
+        given[self._number] = velocity
+        self._jump = self._supports.jumps(given.ravel()[held], dt)
         here = (held >= self.layout.start) & (held < self.layout.end)
         local = self.width * self._mesh.number.astype(np.int64)[:, None] + np.arange(self.width)
         self._is_held = np.isin(local, held)
@@ -266,7 +270,7 @@ class NodalSolid(SolidField):
         if self._lumped is not None:
             self._assemble_lumped(self._lumped, time, dt)
             return
-        stage = self._stage or self._integrator.stage(self._motion(), dt)
+        stage = self._stage or self._rehearsed(dt)
         b = self.rhs.reshape(-1, self.width)
         local = self._with_shared(np.concatenate((stage.tangent_at, stage.inertia, stage.shift), axis=1))
         state = State(*(local[:, n * self.width : (n + 1) * self.width] for n in range(3)))
@@ -287,6 +291,11 @@ class NodalSolid(SolidField):
             self._assembled_for = made_for
         self._elimination.prescribe(self.rhs, self._prescribed)
         self.row_scale = dt / self._reference_mass
+
+    def _rehearsed(self, dt: float) -> Stage:
+        """Return the coming step's equation, linearised where the bodies are: no velocity has been predicted with."""
+        stage = self._integrator.stage(self._motion(), dt)
+        return moved(stage, self.displacement - stage.tangent_at)
 
     def _assemble_lumped(self, lumped: LumpedEquation, time: float, dt: float) -> None:
         """Refresh the diagonal A only if the step's length has changed, and b. Collective."""
@@ -354,6 +363,15 @@ class NodalSolid(SolidField):
             return False
         self._stage = relinearised(stage, x.reshape(-1, self.width))
         return True
+
+    def jolt(self) -> np.ndarray | None:
+        """Return -A[:, F] g for the jump g that supports' velocities make at the start; None if they make none."""
+        if self.explicit or not self._has_inertia or not self._jump.any():
+            return None
+        pull = np.zeros(self.layout.n_local)
+        self._elimination.prescribe(pull, self._jump)
+        pull[self._is_held[: self._mesh.n_owned].ravel()] = 0.0  # these have jumped
+        return pull
 
     def push(self, change: np.ndarray) -> None:
         """Change the present velocities by this much."""

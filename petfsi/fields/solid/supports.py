@@ -18,6 +18,8 @@ from petfsi.scene.schema import Solid
 
 #: Fraction of the first step over which the initial velocity of a prescribed displacement is measured.
 INSTANT = 1e-3
+#: Velocities agree within this part of them, or of what leads a prescribed displacement through the first step.
+AGREE = 1e-5
 
 
 class Supports:
@@ -74,6 +76,7 @@ class Supports:
     def _assign(self, rules: list[tuple[str, Expression]], chosen: np.ndarray, where: np.ndarray) -> None:
         """Note which expression gives which of the unknowns, and at what position."""
         self._values = np.zeros(len(chosen))
+        self._reach = float(np.abs(where).max(initial=0.0))
         self._moving, self._placing = [], []
         for index, (quantity, expression) in enumerate(rules):
             entries = np.flatnonzero(chosen == index)
@@ -120,6 +123,20 @@ class Supports:
             d = [self.displacements(n * tick) for n in range(3)]
             values[self.placed] = (4 * d[1] - 3 * d[0] - d[2]) / (2 * tick)
         return values
+
+    def jumps(self, given: np.ndarray, dt: float) -> np.ndarray:
+        """Return by how much the velocity of each of ``unknowns`` at time zero differs from those given, m/s.
+
+        Zero where they agree, as far as can be told of prescribed displacements.
+        """
+        speed = self.initial_velocities(dt)
+        size, lost = np.maximum(np.abs(speed), np.abs(given)), np.zeros(len(speed))
+        if len(self.placed):
+            begin, end = self.displacements(0.0), self.displacements(dt)
+            size[self.placed] = np.maximum(size[self.placed], np.abs(end - begin) / dt)
+            lost[self.placed] = 10 * np.finfo(float).eps * (np.abs(begin) + self._reach) / (INSTANT * dt)
+        jump = speed - given
+        return np.where(np.abs(jump) > np.maximum(AGREE * size, lost), jump, 0.0)
 
     def reaching(
         self,
