@@ -20,7 +20,8 @@ PATIENCE = 3
 class EnergyGuard:
     """Compares the energy that a run holds with what it can have got.
 
-    It holds kinetic + elastic energy and what damping took so far. It can have got ``Accounts.exchanged``: what it
+    It holds kinetic + elastic energy. (What damping took is no part of it: where that is too fast for the steps the sum
+    of its powers exceeds what there was.) It can have got ``Accounts.exchanged``: what it
     began with and what gravity, loads, supports and sides did since, each step's without its sign. Once it holds more
     than (1 + ``time.energy_limit``) times that, ``PATIENCE`` times running, the motion is the scheme's own.
 
@@ -72,7 +73,7 @@ class EnergyGuard:
         if not accounts.values:
             return
         self.weight = max(self.weight, self._mass_way * float(np.linalg.norm([g(t=time) for g in self._gravity])))
-        parts = {name: accounts.values.get(name, 0.0) for name in ("kinetic", "elastic", "dissipated")}
+        parts = {name: accounts.values.get(name, 0.0) for name in ("kinetic", "elastic")}
         held, got = sum(parts.values()), accounts.exchanged
         most = (1.0 + self.limit) * got + ROUND_OFF * (got + self.weight)
         self.beyond = 0 if held <= most else self.beyond + 1

@@ -122,6 +122,8 @@ def stir(sim: Simulation) -> None:
     speed = MACH * water.law.c / max(1.0, length[1] / length[0])
     v[:, 0] = speed * np.sin(a) * np.cos(b)
     v[:, 1] = -speed * length[1] / length[0] * np.cos(a) * np.sin(b)
+    if sim.accounts.columns:
+        sim.accounts.start()
 
 
 def _pairs(sim: Simulation) -> float:
