@@ -210,7 +210,7 @@ class Bdf2:
 
     def factor(self, h: float, past_dt: float) -> float:
         """Return c; 2h/3 for equal steps, h in the first one."""
-        return h if past_dt == 0.0 else h * (past_dt + h) / (past_dt + 2 * h)
+        return h if past_dt == 0.0 else h * ((past_dt + h) / (past_dt + 2 * h))
 
     def weights(self, h: float, past_dt: float) -> tuple[float, float]:
         """Return b and b'; 4/3 and 1/3 for equal steps, 1 and 0 in the first one."""

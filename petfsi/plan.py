@@ -13,7 +13,6 @@ import numpy as np
 
 from petfsi import __version__
 from petfsi.errors import InputError
-from petfsi.guard import unjudged
 from petfsi.plan_fluids import ENTRY_BYTES, KRYLOV_VECTORS, PRECONDITIONER, fluid_plan, fluid_skipped
 from petfsi.scene.fluids import GridInflowSide, MacFluid
 from petfsi.scene.schema import Scene, Solid
@@ -95,8 +94,8 @@ def skipped(scene: Scene) -> list[str]:
         out.append("gravity: not given")
     if scene.solids and all(s.damping.mass == 0 and s.damping.stiffness == 0 for s in scene.solids.values()):
         out.append("damping: its coefficients are 0")
-    if scene.time.energy_limit >= 0 and unjudged(scene):
-        out.append(f"time.energy_limit: {unjudged(scene)}")
+    if scene.time.energy_limit >= 0 and scene.unjudged:
+        out.append(f"time.energy_limit: {scene.unjudged}")
     if scene.output.every is None:
         out.append("fields.xdmf: there is no output.every")
     return out

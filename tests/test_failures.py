@@ -447,7 +447,6 @@ BEYOND_NUMBERS = {
         3,
         "densities, damping, and the sizes",
     ),
-    "step": (["time.dt=1e-301", "time.end=1e-300"], 3, "the sizes of cells and steps"),
     "size": (
         ["fluid.size=[3e200, 2e200]", "solids.block.shape.box.size=[1e200, 1e200]", "probes={}"],
         2,

@@ -218,6 +218,13 @@ class Scene(Table):
         return self.coupling.transfer or (self.fluid.transfers[0] if self.fluid is not None else "cutcell")
 
     @property
+    def unjudged(self) -> str:
+        """Why nothing can be said of energy out of nothing; empty if something can."""
+        if not self.output.accounts:
+            return "output.accounts is false"
+        return "the integrator is static" if self.time.integrator == "static" else ""
+
+    @property
     def directory(self) -> Path:
         """What relative mesh paths are relative to; of a loaded scene they are absolute already."""
         return self._directory

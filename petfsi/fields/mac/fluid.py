@@ -102,9 +102,11 @@ class MacFluid(CoveredGrid):
         around.evaluate(0.0)
         whole = [sum(jet.area(self.grid) for jet in around.jets if jet.key == key) for key in opened]
         areas = self.comm.allreduce(np.array([list(opened.values()), whole]))
-        notes, unit = [], "m^2" if self.dim == 3 else "m"
+        assert isinstance(self.scene.fluid, fluids.MacFluid)
+        sides, notes, unit = self.scene.fluid.sides, [], "m^2" if self.dim == 3 else "m"
         for key, (left, area) in zip(opened, areas.T, strict=True):
-            if left <= ROUND_OFF * area:
+            side = getattr(sides, key.split(".")[2])
+            if left <= ROUND_OFF * area and side.inflow.region is not None:
                 raise InputError(f"{key}: obstacles cover all of it, and nothing comes in; move them, or its region")
             if left < (1.0 - ROUND_OFF) * area:
                 so_much = f"{left:.4g} of its {area:.4g} {unit}"
