@@ -146,9 +146,12 @@ class Newton:
             snes.setTolerances(atol=self._floor(self._x))
         try:
             snes.solve(None, self._x)
+            self._become(self._x)
         except PETSc.Error as error:
             raise SolveError(f"solver '{snes.getOptionsPrefix()}snes_' broke down: code {error.ierr}") from None
-        self._become(self._x)
+        finally:
+            # it knows the simulation: what is in a circle is let go of at another time on each rank
+            self._restage = as_it_is
         system.solution.array = self._x.array_r
         norms, floor = system.update_residual(), self._floor(self._x)
         if snes.getConvergedReason() < 0 and not norms[""] <= floor:

@@ -42,6 +42,7 @@ def simulation(data, options="monolithic-direct.opts"):
         sim = Simulation(COMM, scene_from_dict(data) if isinstance(data, dict) else data)
         sim.prepare()
         yield sim
+        sim.solver.reset()  # at once on all ranks
 
 
 def history(data, steps):
