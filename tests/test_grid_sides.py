@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from mac_cases import reader
 from mpi4py import MPI
-from test_two_sides import AsField, whole_state
+from test_two_sides import stepped
 
 from petfsi.bench.case import simulation
 from petfsi.errors import InputError
@@ -375,19 +374,6 @@ def everything(integrator):
     more = {"fluid": {"smoke": {"buoyancy": 0.1}}, "gravity": ["0.5*sin(t)", -9.81]}
     more |= {"solids": {"strip": solid}}
     return scene((18, 14), sides, integrator, dt=0.03, **more)
-
-
-def stepped(comm, data, steps, state=None, checkpoint=None):
-    """Return the whole state after steps, from another state if there is one."""
-    with simulation(comm, data, "monolithic.opts") as sim:
-        if state is not None:
-            sim.restore(*state[0], lambda name: reader(state[1][name]))
-        for _ in range(steps):
-            sim.advance()
-            if sim.step == checkpoint:
-                sim.forget()
-        groups = {name: whole_state(AsField(sim.comm, slabs)) for name, slabs in sim.state().items()}
-        return (sim.step, sim.time, sim.dt), groups
 
 
 @pytest.mark.parallel([1, 2])

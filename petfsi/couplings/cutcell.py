@@ -9,9 +9,9 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from petfsi.couplings.base import Coupling
 from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.enclosure import Enclosure
+from petfsi.couplings.walls import WallCoupling
 from petfsi.fields.base import Forces, SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
 from petfsi.geometry.seams import Seams
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 STRIDE = 0.45
 
 
-class CutCellCoupling(Coupling):
+class CutCellCoupling(WallCoupling):
     """Couples a MAC fluid and a solid's surface without loss: D1 H = J^T.
 
     What the walls of a cell let through when they move is J^T u, and J p is the pressure's force on them; see
@@ -206,17 +206,6 @@ class CutCellCoupling(Coupling):
         return Enclosure(
             self.fluid.cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved
         )
-
-    def outflow(self) -> np.ndarray:
-        """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
-        return self._point_flux @ self.solid.surface_velocity().ravel()
-
-    def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
-        """Return by unknown of the fluid what prescribed points let out, of all or of some of them."""
-        if not self.surface.fixed_map.nnz:
-            return None
-        held = self._held if chosen is None else np.where(np.repeat(chosen, self.dim), self._held, 0.0)
-        return self._point_flux @ held
 
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the right sides. Collective."""

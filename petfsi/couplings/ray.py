@@ -10,9 +10,9 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from petfsi.couplings.base import Coupling
 from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
+from petfsi.couplings.walls import WallCoupling
 from petfsi.fields.base import SolidField, Work
 from petfsi.fields.mac.kinds import FLUID, SOLID, SOLID_FACE, VOID
 from petfsi.geometry import rays
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from petfsi.fields.mac.fluid import MacFluid
 
 
-class RayCoupling(Coupling):
+class RayCoupling(WallCoupling):
     """Couples a MAC fluid and a solid's surface as in the paper.
 
     A face whose two cell centres are cut apart by a facet lets through what the solid does where their segment meets
@@ -229,17 +229,6 @@ class RayCoupling(Coupling):
             self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
             self._held_outflow = self._point_flux @ self._held
             self.fluid.rhs -= self._held_outflow
-
-    def outflow(self) -> np.ndarray:
-        """Return what the walls let out of this rank's unknowns at their present velocity. Collective."""
-        return self._point_flux @ self.solid.surface_velocity().ravel()
-
-    def held_outflow(self, chosen: np.ndarray | None = None) -> np.ndarray | None:
-        """Return by unknown of the fluid what prescribed points let out, of all or of some of them."""
-        if not self.surface.fixed_map.nnz:
-            return None
-        held = self._held if chosen is None else np.where(np.repeat(chosen, self.dim), self._held, 0.0)
-        return self._point_flux @ held
 
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the fluid's right side."""
