@@ -47,7 +47,8 @@ class ClosedRegions:
     (V0 - V^n) / h). What is left after the solve, which is of second order, asks for another, with the same matrix.
     With Newmark's rule, d^{n+1} = d^n + h/2 (u^n + w), each source asks for its negative in the next step and swings
     undamped about what is wanted; so there V^{n+1} - V0 = .15 h (s^n - s^{n-1}) / 4, and V0 is what the first half of
-    a step with the velocities at the start makes of it.
+    a step with the velocities at the start makes of it. Sides let in the mean of their flows at a step's begin and end;
+    where those velocities make room for what comes in at the start, that counts once.
 
     Parameters
     ----------
@@ -313,7 +314,10 @@ class ClosedRegions:
 
         self._stride, self._inflow = landing.stride, here
         self._kept = np.array([known.target.get(number, np.nan) for number in self._lasting])
-        self._kept += dt * ((of(known.inflow) + here) / 2 if landing.holds else here) + half
+        came = of(known.inflow)
+        if landing.swings and time == 0.0:
+            half -= dt / 2 * came
+        self._kept += dt * ((came + here) / 2 if landing.holds else here) + half
         self._kept[~self._elastic] = np.nan
         self._wanted = self._kept.copy()
         if landing.swings:

@@ -51,6 +51,20 @@ def test_a_jet_beside_faces_brings_its_part_and_the_momentum_of_that():
         assert sim.accounts.values["momentum.x"] == pytest.approx(RHO * 0.36 * 7.5 / 8, rel=1e-11)
 
 
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_jet_that_changes_leaves_what_it_drives_with_its_own_speed(integrator):
+    """The energy of a full channel is that of the jet at the end of each step, and nothing swings after a jump."""
+    for speed, exact in (
+        ("cos(20*t)", lambda t: np.cos(20 * t)),
+        ("1 + heaviside(t - 0.035)", lambda t: 1 + (t > 0.035)),
+    ):
+        with running(scene((8, 1), {"left": {"inflow": {"speed": speed}}, "right": "open"}, integrator)) as sim:
+            for _ in range(12):
+                sim.advance()
+                wanted = RHO / 2 * exact(sim.time) ** 2 * 7.5 / 8
+                assert sim.accounts.values["kinetic"] == pytest.approx(wanted, rel=0.02)
+
+
 def test_what_a_jet_carries_comes_in_by_its_flux():
     """Through half a face at 2 m/s as much smoke as through a whole one at 1 m/s."""
     jet = {"speed": 2.0, "region": {"box": {"origin": [-0.1, 0.0], "size": [0.2, 0.25]}}, "smoke": 3.0}

@@ -165,6 +165,12 @@ SOUND = {
     "through": flow({"left": jet(0.2), "right": jet(-0.2)}),
     "across": flow({"left": jet(0.2), "top": jet(-0.08)}, None, None, "midpoint"),
     "almost through": flow({"left": jet(0.2), "right": jet(-0.2 * (1 + 1e-12))}),
+    "pushed and pulled as a jet goes": flow(
+        {"left": jet("0.1*sin(20*t)"), "right": jet("-0.1*sin(20*t)")},
+        {"p": box([0.4, 0.0], [0.2, 0.4], held(velocity={"x": "0.1*sin(20*t)"}))},
+        None,
+        "midpoint",
+    ),
     "open": flow({"left": jet(0.2), "right": "open"}, {"d": disk()}),
     "a body that moves": flow({}, {"p": box([0.3, 0.1], [0.3, 0.2], held(velocity={"x": 0.1}))}),
     "swelling": flow({"top": "open"}, {"d": disk(velocity={"x": "(x-.5)*.1", "y": "(y-.2)*.1"})}),

@@ -123,6 +123,21 @@ def test_a_piston_goes_as_far_as_a_jet_drives_it(integrator):
 
 @pytest.mark.parallel([1, 2])
 @pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
+def test_a_free_piston_goes_on_with_a_steady_jet_from_the_first_step(integrator):
+    """All starts with the jet's velocity, and keeps it: what comes in at the start makes room for itself once."""
+    sides = {"left": {"inflow": {"speed": 0.1}}, "right": "open"}
+    data = scene(
+        integrator, dt=0.01, fluid=fluid((16, 4), size=[1.0, 0.25], sides=sides),
+        solids={"piston": solid([0.4, 0.0], [0.2, 0.25], [2, 2], young=1e9)},
+    )  # fmt: skip
+    with prepared(scene_from_dict(data), *DIRECT, comm=COMM) as sim:
+        for _ in range(4):
+            sim.advance()
+            assert np.allclose(sim.solid.velocity, [0.1, 0.0], atol=1e-3)
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("integrator", ["newmark", "bdf2", "midpoint"])
 def test_a_beam_that_closes_a_box_leaves_it_its_volume(integrator):
     """Clamped at both walls. Above it is open: a beam's sections do not thin, so two closed sides would stop it."""
     beam = {"beam": {"start": [0.0, 0.47], "end": [1.0, 0.47], "thickness": 0.02, "elements": 11}}

@@ -255,7 +255,7 @@ class MacFluid(CoveredGrid):
         transport = self._transport
         transport.remember()
         moment, smoke, further = transport.moment(dt), self.smoke, self.smoke_parts
-        self.surroundings.evaluate(time + moment)
+        self.surroundings.evaluate(*transport.instants(time, dt))
         if self.surroundings.carries_along:
             for faces in transport.read():
                 self.surroundings.fill_along(faces)
@@ -359,7 +359,7 @@ class MacFluid(CoveredGrid):
         Collective.
         """
         moment = time + self._transport.moment(dt)
-        self.surroundings.evaluate(moment)
+        self.surroundings.evaluate(*self._transport.instants(time, dt))
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         if dt > 0.0:
             self.open_sides.check(moment)

@@ -113,7 +113,7 @@ class Jet:
 
     @property
     def value(self) -> np.ndarray:
-        """Velocity along the axis at the time last evaluated, the mean over what is open of each face, m/s, (n,)."""
+        """Velocity along the axis as last evaluated, the mean over what is open of each face, m/s, shape (n,)."""
         return self.mean * self._rate
 
     @property
@@ -121,13 +121,14 @@ class Jet:
         """Whether it comes through a part of any face here."""
         return bool(np.any(self.part < 1.0))
 
-    def evaluate(self, time: float) -> None:
-        """Set ``value`` and ``squares`` for a time."""
-        speed = ramp(time, self.spec.ramp) * evaluate_at(self._speed, self.points, time)
+    def evaluate(self, *times: float) -> None:
+        """Set ``value`` to the mean over some times, and ``squares`` to what belongs to that."""
+        speeds = [ramp(t, self.spec.ramp) * evaluate_at(self._speed, self.points, t) for t in times]
+        speed: np.ndarray = np.mean(speeds, axis=0)
         self._rate[:] = (-1.0 if self.upper else 1.0) * speed
         self.squares[:] = speed**2
         for along in self._along:
-            self.squares += evaluate_at(along, self.points, time) ** 2
+            self.squares += evaluate_at(along, self.points, float(np.mean(times))) ** 2
 
     def open_fully(self) -> None:
         """Set ``value`` to what a speed of 1 m/s everywhere would make it."""
@@ -236,15 +237,15 @@ class Surroundings:
         self.cell_kind[part][covered] = kinds.OBSTACLE
         self.grid.exchange_cells(self.cell_kind)
 
-    def evaluate(self, time: float) -> None:
-        """Evaluate all jets at a time. Collective."""
+    def evaluate(self, *times: float) -> None:
+        """Evaluate all jets: their mean over some times. Collective."""
         if self.has_jets:
-            agreed(self.grid.comm, lambda: self._evaluate_here(time))
+            agreed(self.grid.comm, lambda: self._evaluate_here(*times))
 
-    def _evaluate_here(self, time: float) -> None:
-        self.time = time
+    def _evaluate_here(self, *times: float) -> None:
+        self.time = float(np.mean(times))
         for jet in self.jets:
-            jet.evaluate(time)
+            jet.evaluate(*times)
 
     def prescribe(self, face_kind: list[np.ndarray], boundary_velocity: list[np.ndarray]) -> None:
         """Write the velocity of every WALL face: that of a jet, else zero."""
@@ -299,7 +300,7 @@ class Surroundings:
         return np.where(has[part], plane[part] + beside, across + along)
 
     def fill_along(self, velocity: list[np.ndarray]) -> None:
-        """Give the ghosts behind jets the velocity along their sides at the time last evaluated. Collective."""
+        """Give the ghosts behind jets the velocity along their sides amid the times last evaluated. Collective."""
         agreed(self.grid.comm, lambda: self._fill_along_here(velocity))
 
     def _fill_along_here(self, velocity: list[np.ndarray]) -> None:

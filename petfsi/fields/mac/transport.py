@@ -59,6 +59,10 @@ class Transport:
         """Return how long after the step's begin v_w holds, s."""
         return self.integrator.moment(dt)
 
+    def instants(self, time: float, dt: float) -> list[float]:
+        """Return the times, s, over which v_w of a prescribed velocity is the mean: the same as of solids' supports."""
+        return [time + later for later in self.integrator.instants(dt)]
+
     def solved(self, velocity: Faces) -> Faces:
         """Return v_w of the step last accepted, which has no divergence, given the velocity at its end."""
         return velocity
