@@ -144,9 +144,12 @@ class ClosedRegions:
         return here
 
     def _facet_labels(self) -> np.ndarray:
-        """Return which of the present regions each facet bounds, counted from 1; 0 is none. Collective."""
+        """Return which of the present regions each facet bounds, counted from 1; 0 is none. Collective.
+
+        As many facets where nothing is closed: a run that goes on reads what a checkpoint has of each.
+        """
         if self._walls is None:
-            return np.zeros(0, dtype=np.int64)
+            return np.zeros(sum(coupling.n_enclosing for coupling in self.system.couplings), dtype=np.int64)
         return bounded_most(self.system.comm.allreduce(self._walls.parts()))
 
     def _facet_numbers(self, labels: np.ndarray) -> np.ndarray:
@@ -175,10 +178,7 @@ class ClosedRegions:
         self._cut_sizes, moved, past = total[: 3 * n_new].reshape(3, n_new)
         self._sizes = self._end = self._cut_sizes + moved
         cells = total[3 * n_new :].reshape(shared.shape)
-        if len(labels) == len(known.facets):
-            meets = meeting(cells, pairs(place[known.facets], labels, len(old), n_new))
-        else:
-            meets = meeting(cells, np.zeros_like(cells))
+        meets = meeting(cells, pairs(place[known.facets], labels, len(old), n_new))
         same = meets & (meets.sum(axis=0) == 1) & (meets.sum(axis=1) == 1)[:, None]
         first, second = np.nonzero(same)
         self._lasting = [0] * n_new

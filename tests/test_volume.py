@@ -66,7 +66,7 @@ def test_the_change_of_volume_is_exact_for_any_way(dim):
     flux = np.repeat(-area.ravel()[:, None] / dim, dim, axis=1)
     walls = Walls(facet, axis, np.full(len(facet), 5), flux)
     nothing = csr_matrix((1, points.size))
-    around = Enclosure(points, facets, walls, 5, nothing, [np.ones(1)])
+    around = Enclosure(points, facets, np.arange(len(facets)), len(facets), walls, 5, nothing, [np.ones(1)])
     there = points + rng.normal(size=points.shape)
     assert around.change(there)[0] == pytest.approx(enclosed(points) - enclosed(there), rel=1e-13)
 
@@ -198,6 +198,24 @@ def test_what_volumes_are_kept_is_in_the_checkpoint(integrator):
     data["time"] |= changing
     sim = goes_on(scene_from_dict(data), "-options_file", "monolithic.opts")
     assert sim.regions.volumes.size == 2
+
+
+@pytest.mark.parallel([1, 2])
+def test_checkpoints_have_room_for_regions_that_close_and_open():
+    """A block leaves the gap below an obstacle, and with that the water behind it is no longer closed."""
+    jet = {"inflow": {"speed": 1.0, "region": {"box": {"origin": [-0.1, 0.0], "size": [0.2, 0.5]}}}}
+    block = solid(
+        [0.3, 0.0], [0.2, 0.5], [2, 3], supports=[{"where": "all", "fix": ["x", "y"], "velocity": {"x": 1.0}}]
+    )
+    data = scene("bdf2", dt=0.05, fluid=fluid((12, 12), sides={"left": jet, "right": "open"}), solids={"block": block})
+    data["obstacles"] = {"above": {"shape": {"box": {"origin": [-0.1, 0.5], "size": [0.6, 0.6]}}}}
+    with prepared(scene_from_dict(data), *DIRECT, comm=COMM) as sim:
+        shapes = []
+        while len(shapes) < 6:
+            shapes.append({name: slab.shape for name, slab in sim.regions.state().items()})
+            sim.advance()
+        assert np.isnan(sim.regions.volumes).all()
+    assert all(shape == shapes[0] for shape in shapes)
 
 
 @pytest.mark.parallel([2])

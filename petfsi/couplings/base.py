@@ -65,6 +65,11 @@ class Coupling(ABC):
         """
         return None
 
+    @property
+    def n_enclosing(self) -> int:
+        """How many facets ``enclose`` tells of, at any time."""
+        return 0
+
     def outflow(self) -> np.ndarray:
         """Return what solids' walls let out of this rank's unknowns of the fluid at their present velocity. Collective.
 

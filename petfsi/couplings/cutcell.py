@@ -203,9 +203,13 @@ class CutCellCoupling(WallCoupling):
         assert self._seams is not None
         walls, start = self._seams.walls, self.fluid.layout.start
         curved = None if self.curved is None else self.curved.take(walls)
-        return Enclosure(
-            self.fluid.cut_at, self.facets[walls], self._let_through, start, self._point_flux, members, curved
-        )
+        surface = self.fluid.cut_at, self.facets[walls], walls, len(self.facets)
+        return Enclosure(*surface, self._let_through, start, self._point_flux, members, curved)
+
+    @property
+    def n_enclosing(self) -> int:
+        """How many facets may bound regions, at any time."""
+        return len(self.facets)
 
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the right sides. Collective."""

@@ -25,7 +25,11 @@ class Enclosure:
     ----------
     cut_at : ndarray, shape (n_points, dim)
         Where the surface was cut.
-    facets : ndarray of int, shape (n_facets, dim)
+    facets : ndarray of int, shape (n_walls, dim)
+        Those that are walls.
+    number : ndarray of int, shape (n_walls,)
+        Which of all ``n_facets`` of the surface they are.
+    n_facets : int
     walls : Walls
         This rank's.
     first : int
@@ -39,8 +43,8 @@ class Enclosure:
     """
 
     def __init__(
-        self, cut_at: np.ndarray, facets: np.ndarray, walls: Walls, first: int, point_flux: csr_matrix,
-        members: list[np.ndarray], curved: Curved | None = None,
+        self, cut_at: np.ndarray, facets: np.ndarray, number: np.ndarray, n_facets: int, walls: Walls, first: int,
+        point_flux: csr_matrix, members: list[np.ndarray], curved: Curved | None = None,
     ) -> None:  # fmt: skip
         self._cut_at = cut_at
         self._slope = np.array([point_flux.T @ member for member in members])
@@ -56,11 +60,11 @@ class Enclosure:
         part = -walls.flux[use] * (area[facet, walls.axis[use]] / squares[facet])[:, None]
         if curved is not None:
             part = curved.to_corners(facet, part)
-        bounding, number = np.unique(facet, return_inverse=True)
-        self._bounding, self._n_facets = bounding, len(facets)
+        bounding, place = np.unique(facet, return_inverse=True)
+        self._bounding, self._n_facets = number[bounding], n_facets
         self._facets = facets[bounding]
         n = part.shape[1]
-        rows, columns = np.repeat(region[use], n), (n * number[:, None] + np.arange(n)).ravel()
+        rows, columns = np.repeat(region[use], n), (n * place[:, None] + np.arange(n)).ravel()
         shape = len(members), n * len(bounding)
         self._share = coo_matrix((part.ravel(), (rows, columns)), shape=shape).tocsr()
 
