@@ -3,6 +3,8 @@
 Regions of fluid that are closed leave L singular, on all levels.
 
 hypre               BoomerAMG eliminates on its coarsest grid; a pivot that vanishes there is noise. It relaxes instead.
+gamg                Aggregates join rows however weakly they are linked, but in long cells what smoothers leave is not
+                    smooth along weak links. Strong ones alone join: 15 iterations for more than 500 in cells of 80:1.
 mg, its last level  by singular values, as it is small. The least is what round-off makes of 0, and PETSc takes for zero
                     what lies below an absolute number. Where the level is the first one again (see ``multigrid``), by
                     a cycle of BoomerAMG, for it follows what walls part.
@@ -18,6 +20,10 @@ SINGULAR = {
     "pc_hypre_boomeramg_relax_type_coarse": "symmetric-SOR/Jacobi",
     "pc_hypre_boomeramg_grid_sweeps_coarse": "10",
 }
+#: Of gamg: links below this part of the diagonal do not join aggregates; a cube's are 1/6 of it.
+STRONG = {"pc_gamg_threshold": "0.05"}
+#: By type, for those that stand in the first place.
+DEFAULTS = {PETSc.PC.Type.HYPRE: SINGULAR, PETSc.PC.Type.GAMG: STRONG}
 ALGEBRAIC = SINGULAR | {
     "pc_type": "hypre",
     "pc_hypre_type": "boomeramg",

@@ -10,7 +10,7 @@ from petfsi.errors import InputError
 from petfsi.fields.base import PressureFluid, SolidField
 from petfsi.modes import DEGREE, LIGHT, LINEAR, MOST, Modes
 from petfsi.multigrid import Hierarchy, Multigrid
-from petfsi.preconditioners import SINGULAR, read_options
+from petfsi.preconditioners import DEFAULTS, read_options
 from petfsi.resisted import Resisted
 from petfsi.schur import FAINT, SchurStandIn
 from petfsi.smoothers import DOMINANT
@@ -74,8 +74,8 @@ class PressureSolver:
                 raise InputError(f"option -{pc.getOptionsPrefix()}pc_type mg: needs a grid; hypre and gamg do not")
             fine = self.stand_in.operator if self.stand_in is not None else self.fluid.block
             self._multigrid = Multigrid(pc, hierarchy, fine)
-        elif pc.getType() == PETSc.PC.Type.HYPRE:
-            read_options(pc, SINGULAR)
+        elif pc.getType() in DEFAULTS:
+            read_options(pc, DEFAULTS[pc.getType()])
         self._pass_on()
         if self.stand_in is not None and self._symmetric():
             self._add_modes(ksp)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sysconfig
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any
-from weakref import finalize
 
 import numpy as np
 from petsc4py import PETSc
 
-from petfsi import petsc
+from petfsi import petsc, releases
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import PressureFluid
 from petfsi.multigrid import Hierarchy
@@ -191,9 +191,11 @@ class Solver:
         """Create the KSP if there is none and let everything inside it read its options. Collective."""
         try:
             if self._ksp is None:
+                held = releases.of(self.system.comm)
+                held.sweep(self.system.comm)
                 self._ksp = self._create()
                 # what PETSc runs in Python must be gone before Python is
-                self._release = finalize(self, _release, self._ksp, self._pressure)
+                self._release = held.add(self, partial(_release, self._ksp, self._pressure))
             elif self.converts:
                 self._ksp.setOperators(self._convert())
             elif self._pressure is not None:

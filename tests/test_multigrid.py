@@ -274,6 +274,7 @@ def test_grids_are_coarsened_along_the_short_sides_of_cells_until_these_are_as_l
     assert seen == [(64, 17), (64, 9), (64, 5), (32, 3), (16, 2), (8, 1), (4, 1), (2, 1), (1, 1)]
 
 
+SOLVERS = {"mg": [], "hypre": [f"{PRESSURE}pc_type", "hypre"], "gamg": [f"{PRESSURE}pc_type", "gamg"], "direct": None}
 LONG = [(1, 1), (5, 1), (1, 20), (80, 1), (1, 400), (1, 5, 1), (20, 1, 20), (1, 80, 400)]
 
 
@@ -299,6 +300,15 @@ def test_plates_along_long_cells_are_solved_as_a_factorisation_does(ratio, densi
         np.testing.assert_allclose(ours[name], theirs[name], atol=1e-6 * np.abs(theirs[name]).max())
 
 
+@pytest.mark.parametrize("name", ["hypre", "gamg"])
+@pytest.mark.parametrize("ratios", [(1, 1), (80, 1), (1, 400), (20, 1, 20)], ids=str)
+def test_algebraic_preconditioners_are_usable_in_long_cells(ratios, name):
+    cells = (48, 48) if len(ratios) == 2 else (12, 12, 12)
+    for density, most in ((None, 30), (1e3, 30), (1.0, 60)):
+        outcome = solved(long_cells(cells, ratios, {"right": "open"}, density), DEFAULT, *SOLVERS[name])[0]
+        assert outcome.iterations <= most
+
+
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("density", [None, 1e3, 1.0])
 def test_ranks_take_as_many_iterations_in_long_cells_as_one(density):
@@ -308,7 +318,6 @@ def test_ranks_take_as_many_iterations_in_long_cells_as_one(density):
 
 
 TINY = [(1, 1), (1, 2), (2, 1), (1, 5), (4, 4), (5, 3), (1, 1, 1), (3, 2, 1), (2, 5, 3)]
-SOLVERS = {"mg": [], "hypre": [f"{PRESSURE}pc_type", "hypre"], "gamg": [f"{PRESSURE}pc_type", "gamg"], "direct": None}
 
 
 @pytest.mark.parametrize("solid", [False, True])

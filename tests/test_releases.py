@@ -1,0 +1,58 @@
+"""Solvers that Python's collector finds on each rank at a time of its own."""
+
+import gc
+
+import pytest
+from mpi4py import MPI
+from step_cases import block
+
+from petfsi import releases
+from petfsi.bench.case import only_options
+from petfsi.simulation import Simulation
+
+COMM = MPI.COMM_WORLD
+
+
+class Owner:
+    pass
+
+
+def test_what_was_collected_is_released_where_ranks_meet_in_the_order_of_making():
+    held, seen, owners = releases.Releases(), [], [Owner() for _ in range(3)]
+    nows = [held.add(owner, lambda n=n: seen.append(n)) for n, owner in enumerate(owners)]
+    nows[1]()
+    assert seen == [1]
+    owners.clear()
+    gc.collect()
+    assert seen == [1]
+    held.sweep(MPI.COMM_SELF)
+    assert seen == [1, 0, 2]
+    last = Owner()
+    held.add(last, lambda: seen.append(3))
+    held.end()
+    assert seen == [1, 0, 2, 3]
+
+
+@pytest.mark.parallel([2, 3])
+def test_a_rank_that_collects_a_solver_before_the_others_waits_for_nobody():
+    held = releases.of(COMM)
+    held.sweep(COMM)
+    gc.disable()
+    try:
+        with only_options(["-options_file", "monolithic.opts"]):
+            sim = Simulation(COMM, block((4, 4)))
+            sim.prepare()
+            sim.advance()
+            sim.me = sim  # nothing but the collector lets go of it
+            before = len(held._held)
+            del sim
+            if COMM.rank == 0:
+                gc.collect()
+            COMM.Barrier()  # a solver destroyed above would wait for the others, who wait here
+            held.sweep(COMM)
+            assert len(held._held) == before  # others hold it still
+            gc.collect()
+            held.sweep(COMM)
+            assert len(held._held) < before
+    finally:
+        gc.enable()
