@@ -52,6 +52,7 @@ class EnergyGuard:
         asked = self.limit >= 0 and "energy_limit" in scene.time.model_fields_set
         self.notes = [] if scene.output.accounts or not asked else [f"time.energy_limit: {scene.unjudged}"]
         self._gravity, self._mass_way = _may_fall(scene)
+        self._strained = _strained(scene)
         self.beyond, self.weight = 0, 0.0
 
     def judge(self, accounts: Accounts, time: float, advice: str) -> None:
@@ -77,7 +78,7 @@ class EnergyGuard:
         # pairs of particles and a body store energy as negative losses
         stored = min(0.0, accounts.values.get("dissipated", 0.0))
         held, got = sum(parts.values()) + stored, accounts.exchanged
-        most = (1.0 + self.limit) * got + ROUND_OFF * (got + self.weight)
+        most = (1.0 + self.limit) * got + ROUND_OFF * (got + self.weight) + self._strained
         self.beyond = 0 if held <= most else self.beyond + 1
         if not self._watches or self.beyond < PATIENCE:
             return
@@ -107,3 +108,14 @@ def _may_fall(scene: Scene) -> tuple[list[Expression], float]:
     size = np.asarray(scene.fluid.size)
     mass = scene.fluid.density * float(size.prod())
     return [Expression(g, ("t",), "gravity") for g in scene.gravity or []], mass * float(size.max())
+
+
+def _strained(scene: Scene) -> float:
+    """Return the energy of strains that are round-off in the whole of the fluid's box, J (per m in 2D).
+
+    Where nothing pulls, and nothing moves, there is no other energy to compare with.
+    """
+    if scene.fluid is None:
+        return 0.0
+    stiffness = sum(solid.young for solid in scene.solids.values())
+    return float(np.finfo(float).eps) ** 2 * stiffness * float(np.prod(scene.fluid.size))

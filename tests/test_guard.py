@@ -182,3 +182,18 @@ def test_a_residual_that_pays_for_what_left_is_no_energy():
             assert sim.guard.beyond == 0
         values = sim.accounts.values
     assert values["kinetic"] < 1.5 * first and values["energy_residual"] > 2 * values["kinetic"]
+
+
+@pytest.mark.parametrize("young", [1e5, 1e12])
+def test_where_nothing_pulls_and_nothing_moves_round_off_alarms_nobody(young):
+    """A body with a face in a plane of the grid, in a closed box without gravity: strains of eps are no energy."""
+    shape = {"box": {"origin": [0.3, 0.3], "size": [0.4, 0.2], "cells": [4, 2]}}
+    water = {"density": 1000.0, "origin": [0.0, 0.0], "size": [1.0, 1.0], "cells": [12, 12]}
+    data = {
+        "dim": 2, "time": {"end": 1.0, "dt": 0.05, "integrator": "midpoint"}, "fluid": water,
+        "solids": {"b": {"shape": shape, "density": 1000.0, "young": young, "poisson": 0.3}},
+    }  # fmt: skip
+    with prepared(scene_from_dict(data), "-options_file", "monolithic.opts") as sim:
+        for _ in range(4):
+            sim.advance()
+        assert sim.accounts.values["kinetic"] < 1e-25
