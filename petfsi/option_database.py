@@ -47,9 +47,9 @@ def only(options: Options) -> Iterator[None]:
 def unread() -> list[str]:
     """Return the names that the user has given under petfsi's prefix and that no solver has asked for."""
     call, used = petsc.library().PetscOptionsUsed, ctypes.c_int()
-    names = []
+    names, there = [], {name.lower() for name in PETSc.Options().getAll()}
     for name, option in _in_force.chosen.items():
-        if not option.shipped:
+        if not option.shipped and name in there:
             call(None, name.encode(), ctypes.byref(used))
             if not used.value:
                 names.append(name)

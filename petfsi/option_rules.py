@@ -65,6 +65,8 @@ class Range:
     def __str__(self) -> str:
         """Say the range."""
         kind = "a whole number" if self.whole else "a number"
+        if self.least == self.most:
+            return f"{self.least:g}"
         if self.most >= 1e300:
             return f"{kind} of at least {self.least:g}"
         return f"{kind} from {self.least:g} to {self.most:g}"

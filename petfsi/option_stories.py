@@ -66,7 +66,7 @@ def _lacks(name: str, now: Mapping[str, Option]) -> str:
     starts = [at for at in range(len(PREFIX), len(name)) if name[at - 1] == "_"]
     for at in starts:
         for part, kind, wanted in NEEDS:
-            if name.startswith(part, at) and name != f"{name[:at]}{kind}":
+            if name.startswith(part, at) and (part != "snes_" or at == len(PREFIX)) and name != f"{name[:at]}{kind}":
                 needed = f"{name[:at]}{kind}"
                 is_now = now[needed].value if needed in now else ""
                 if is_now not in wanted:
@@ -94,24 +94,45 @@ def _near(name: str, prefix: str, known: Sequence[str]) -> str:
 def petsc_text(error: PETSc.Error) -> str:
     """Return the last words of a PETSc error: what it said, without where in PETSc."""
     lines = [line.split("]", 1)[-1].strip() for line in str(error).splitlines()]
-    return next((line for line in reversed(lines) if line and "()" not in line), f"error code {error.ierr}")
+    where = max((number for number, line in enumerate(lines) if "() at " in line), default=0)
+    said = [line for line in lines[where + 1 :] if line and not line.startswith(("*", "Unknown type. Check"))]
+    return shown(" ".join(said).rstrip(".,: "), 300) or f"error code {error.ierr}"
 
 
 def option_story(prefix: str, error: PETSc.Error) -> str:
     """Return which option of a solver PETSc could not follow, and why."""
-    text = petsc_text(error).rstrip(".")
-    option = " or ".join(_options_meant(text, prefix)) or f"-{prefix}..."
-    hint = "; all of the matrix can be factorised with -fsi_mat_type aij" if "type nest" in text else ""
-    return f"option {option}: PETSc cannot set this solver up: {text}{hint} (code {error.ierr})"
+    text = petsc_text(error)
+    meant = _options_meant(text, prefix)
+    hint = ""
+    if "Python context" in text:
+        meant = [o for o in _given(prefix) if o.value == "python"] or [
+            o for o in _given("") if o.name.endswith("mat_type")
+        ]
+        text = "petfsi's preconditioners are for the pressure of a nest, under -fsi_fieldsplit_pressure_mg_levels_"
+    elif "type nest" in text:
+        hint = "; all of the matrix can be factorised with -fsi_mat_type aij"
+    places = {option.place for option in meant}
+    place = places.pop() if len(places) == 1 else ""
+    options = _either([str(option) for option in meant]) or f"-{prefix}..."
+    return f"{place}option {options}: PETSc cannot set this solver up: {text}{hint} (code {error.ierr})"
 
 
-def _options_meant(text: str, prefix: str) -> list[str]:
-    """Return the options that a PETSc message speaks of; most name the value only."""
-    words = {word.rstrip(".,") for word in text.split()}
-    values = PETSc.Options().getAll()
-    options = {f"-{name}": value for name, value in sorted(values.items()) if name.startswith(prefix)}
+def _options_meant(text: str, prefix: str) -> list[Option]:
+    """Return the options that a PETSc message speaks of, or else may mean; most name the value only."""
+    words = {word.strip(".,:'\"()").lower() for word in text.split()}
+    options = sorted(option_database.in_force().chosen.values(), key=lambda option: (option.shipped, option.name))
     kind = next((f"_{kind.lower()}_type" for kind in ("KSP", "PC") if f"{kind} type" in text), "")
-    named = [name for name in options if name in words]
-    return [f"{name} {options[name]}" for name in named] or [
-        f"{name} {value}" for name, value in options.items() if value in words and name.endswith(kind)
-    ]
+    named = [option for option in options if f"-{option.name}" in words]
+    told = [option for option in options if option.value.lower() in words and option.name.endswith(kind)]
+    return named or [option for option in told if not option.shipped] or told or _given(prefix)
+
+
+def _given(prefix: str) -> list[Option]:
+    """Return what the user has given under a prefix."""
+    now = option_database.in_force().chosen
+    return [option for name, option in sorted(now.items()) if name.startswith(prefix) and not option.shipped]
+
+
+def _either(options: Sequence[str]) -> str:
+    few = list(options[:TOLD])
+    return " or ".join(few) + (f" or one of {len(options) - TOLD} more" if len(options) > TOLD else "")

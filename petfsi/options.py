@@ -80,6 +80,11 @@ class Options:
     left_out: list[Option] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def given(self) -> bool:
+        """Whether any is the user's."""
+        return not all(option.shipped for option in self.chosen.values())
+
     def starting(self) -> list[str]:
         """Return the words that PETSc is started with."""
         return [word for name, option in self.at_start.items() for word in (f"-{name}", option.value) if word]
@@ -306,7 +311,10 @@ def _put(option: Option, lower: Mapping[str, Option], result: Options, fits: Fit
     note, before = f"option {option} ({option.origin})", lower.get(option.name)
     if before is not None and before.value != option.value:
         note += f", not {before.value or 'without a value'} ({before.origin})"
-        gone = [name for name in hanging(before, option.value, lower, fits) if result.chosen.pop(name, None)]
+        hung = hanging(before, option.value, lower, fits)
+        gone = [name for name in hung if result.chosen.get(name) is lower[name]]  # what is given beside it stays
+        for name in gone:
+            del result.chosen[name]
         if gone:
             note += f"; gone with it: {_cut([f'-{name}' for name in gone], ', ')}"
     result.chosen[option.name] = option
@@ -337,11 +345,12 @@ def hanging(before: Option, new: str, stored: Mapping[str, Option], fits: Fits) 
         return [name for name in stored if name.startswith(top) and not name.startswith(others)]
     if stem.endswith("_ksp_"):
         rest = [name for name in stored if name.startswith(stem) and name != before.name]
-        return (
-            rest
-            if new == "preonly"
-            else [n for n in rest if n in own or not fits(new, n[len(stem) :], stored[n].value)]
-        )
+        if new == "preonly":
+            return rest
+        test = stored.get(f"{stem}convergence_test")
+        if test is not None and test.value == "skip":  # a fixed number of iterations is a scheme of that type alone
+            own += [f"{stem}{name}" for name in ("convergence_test", "norm_type", "max_it")]
+        return [name for name in rest if name in own or not fits(new, name[len(stem) :], stored[name].value)]
     if stem.endswith("_pc_factor_mat_solver_"):
         top = stem.removesuffix("pc_factor_mat_solver_")
         return [name for name in stored if name.startswith(f"{top}mat_{old}_")]

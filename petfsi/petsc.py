@@ -14,6 +14,8 @@ from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 
 IntType = PETSc.IntType
+#: Codes of errors that numbers make, and no option: a zero pivot, no number, no convergence.
+NUMERICAL = (71, 72, 91)
 
 
 @dataclass(frozen=True)

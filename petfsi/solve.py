@@ -435,14 +435,30 @@ class Solver:
         self.system.check_operator()
         self.set_up()
         assert self._ksp is not None
-        if self.iterates:
-            self._iteration()
         try:
+            if self.iterates:
+                self._iteration()
             self._ksp.getPC().apply(self.system.rhs, self.system.residual)
+            if option_database.in_force().given:
+                self._try()
         except PETSc.Error as error:
             raise InputError(option_story(self.prefix, error)) from None
         self._refuse_unread()
         return self._unused()
+
+    def _try(self) -> None:
+        """Iterate once, so that what PETSc refuses only when it solves shows now. Collective."""
+        ksp = self._ksp
+        assert ksp is not None
+        most = ksp.getTolerances()[3]
+        ksp.setTolerances(max_it=min(most, 1))
+        try:
+            ksp.solve(self.system.rhs, self.system.residual)
+        except PETSc.Error as error:
+            if error.ierr not in petsc.NUMERICAL:
+                raise
+        finally:
+            ksp.setTolerances(max_it=most)
 
     def _refuse_unread(self) -> None:
         unread = [name for name in option_database.unread() if not name.startswith(self._absent())]
