@@ -105,9 +105,9 @@ def option_story(prefix: str, error: PETSc.Error) -> str:
     meant = _options_meant(text, prefix)
     hint = ""
     if "Python context" in text:
-        meant = [o for o in _given(prefix) if o.value == "python"] or [
-            o for o in _given("") if o.name.endswith("mat_type")
-        ]
+        given = _given("")
+        told = [option for option in given if option.value == "python" or option.name.endswith("mat_type")]
+        meant = told or given
         text = "petfsi's preconditioners are for the pressure of a nest, under -fsi_fieldsplit_pressure_mg_levels_"
     elif "type nest" in text:
         hint = "; all of the matrix can be factorised with -fsi_mat_type aij"

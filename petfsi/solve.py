@@ -143,6 +143,12 @@ class Solver:
         if not single and mat_type not in ("nest", "aij"):
             raise InputError(f"option -{self.prefix}mat_type {mat_type}: must be nest or aij")
         self.converts = mat_type == "aij" and not single
+        kind = options.getString("pc_type", PETSc.PC.Type.FIELDSPLIT)
+        if not single and not self.converts and kind not in NEST:  # some crash on a nest, before they are refused
+            raise InputError(
+                f"option -{self.prefix}pc_type {kind}: the matrix type nest is for {', '.join(NEST)}; "
+                f"all of the matrix can be factorised with -{self.prefix}mat_type aij"
+            )
         split = options.getString("pc_fieldsplit_type", "multiplicative")
         self.decoupled = not single and splits and split != "schur"
         # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
@@ -490,5 +496,7 @@ def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
     ksp.destroy()
 
 
+#: Preconditioners of a matrix in blocks.
+NEST = ("fieldsplit", "jacobi", "none")
 #: Fields that the shipped files have options for, whether they are in a scene or not.
 SHIPPED = ("solid", "pressure", "particles")
