@@ -95,7 +95,9 @@ def petsc_text(error: PETSc.Error) -> str:
     """Return the last words of a PETSc error: what it said, without where in PETSc."""
     lines = [line.split("]", 1)[-1].strip() for line in str(error).splitlines()]
     where = max((number for number, line in enumerate(lines) if "() at " in line), default=0)
-    said = [line for line in lines[where + 1 :] if line and not line.startswith(("*", "Unknown type. Check"))]
+    said = [
+        line for line in lines[where + 1 :] if line and not line.startswith(("*", "See http", "Unknown type. Check"))
+    ]
     return shown(" ".join(said).rstrip(".,: "), 300) or f"error code {error.ierr}"
 
 
@@ -119,11 +121,11 @@ def option_story(prefix: str, error: PETSc.Error) -> str:
 
 def _options_meant(text: str, prefix: str) -> list[Option]:
     """Return the options that a PETSc message speaks of, or else may mean; most name the value only."""
-    words = {word.strip(".,:'\"()").lower() for word in text.split()}
+    words = {word.strip(".,:'\"()") for word in text.split()}
     options = sorted(option_database.in_force().chosen.values(), key=lambda option: (option.shipped, option.name))
     kind = next((f"_{kind.lower()}_type" for kind in ("KSP", "PC") if f"{kind} type" in text), "")
-    named = [option for option in options if f"-{option.name}" in words]
-    told = [option for option in options if option.value.lower() in words and option.name.endswith(kind)]
+    named = [option for option in options if f"-{option.name}" in {word.lower() for word in words}]
+    told = [option for option in options if option.value in words and option.name.endswith(kind)]
     return named or [option for option in told if not option.shipped] or told or _given(prefix)
 
 
