@@ -82,6 +82,13 @@ RANGES = {
     "_max_it": Range(0, 1_000_000, whole=True),
     "_max_its": Range(0, 1_000_000, whole=True),
     "_restart": Range(1, 1000, whole=True),
+    # so many vectors are kept
+    "_ell": Range(1, 100, whole=True),
+    "_augment": Range(0, 1000, whole=True),
+    "_mmax": Range(1, 1000, whole=True),
+    "_nprealloc": Range(0, 1000, whole=True),
+    "_max_eigen": Range(0, 1000, whole=True),
+    "_fischer_guess": Range(1, 1000, whole=True),
     "_levels": Range(0, 100, whole=True),
     "_overlap": Range(0, 100, whole=True),
     "_sweeps": Range(0, 1000, whole=True),
@@ -160,7 +167,8 @@ def _misfit(name: str, value: str) -> str:
     if (wanted is not None or name.endswith(_VALUED)) and not value:
         return "wants a value behind it"
     if wanted is not None:
-        return wanted.fault(value)
+        parts = value.split(",") if name.endswith("_fischer_guess") else [value]
+        return next(filter(None, map(wanted.fault, parts)), "")
     for part in value.split(","):
         if _NO_NUMBER.fullmatch(part):
             return "wants a number that is one, and finite"

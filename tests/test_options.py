@@ -83,6 +83,8 @@ def test_what_speaks_to_the_screen_is_not(word):
         ("ksp_richardson_scale", "inf", "a number that is one, and finite"),
         ("ksp_chebyshev_eigenvalues", "0.4,1e999", "too large"),
         ("pc_factor_levels", "100000", "out of range"),
+        ("ksp_bcgsl_ell", "100000000", "out of range; wanted a whole number from 1 to 100"),
+        ("ksp_fischer_guess", "1,100000000", "out of range"),
         ("pc_factor_shift_amount", "a b", "blanks, quotes, paths"),
         ("pc_type", "l\x00u", "blanks, quotes, paths"),
         ("pc_type", "/etc/passwd", "blanks, quotes, paths"),
