@@ -116,7 +116,7 @@ def run(
         from petfsi.scene.load import load_scene
 
         loaded = on_root(comm, lambda: load_scene(scene, sets))
-        _start_petsc(petsc)
+        _start_petsc(petsc, comm)
         from petfsi.run import run_scene
 
         return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite)
@@ -139,8 +139,8 @@ def resume(
     """
     petsc = ctx.meta["petsc"]
 
-    def work(_comm: MPI.Comm) -> int:
-        _start_petsc(petsc)
+    def work(comm: MPI.Comm) -> int:
+        _start_petsc(petsc, comm)
         from petfsi.run import resume_run
 
         return resume_run(directory, steps, petsc, wall_limit, list(sets))
@@ -165,7 +165,7 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
         with np.errstate(all="ignore"):  # what overflows is told of by those who judge what it gives
             plan = describe_plan(loaded, ctx.meta["petsc"])
             if may_lack_a_solution(loaded):
-                _start_petsc([])
+                _start_petsc()
                 judge_first_step(loaded)
         _say(plan)
         return 0
@@ -199,7 +199,7 @@ def plot(
         raise click.UsageError("--fps is the speed of a film: give --film, too", ctx)
 
     def work() -> int:
-        _start_petsc([])  # before the fields' code does, with a signal handler
+        _start_petsc()  # before the fields' code does, with a signal handler
         if film is not None:
             if _launched_rank() > 0:
                 return 0  # a film is one file
@@ -234,7 +234,7 @@ def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoRet
         if name is None:
             _say(describe())
             return 0
-        _start_petsc([])
+        _start_petsc()
         return run_bench(comm, name, out, quick)
 
     ctx.exit(_together(work))
@@ -246,7 +246,7 @@ def info(ctx: click.Context) -> NoReturn:
     """Print versions, what PETSc was built with, solver prefixes and the shipped options files."""
 
     def work() -> int:
-        _start_petsc([])
+        _start_petsc()
         from petfsi.plan import describe_info
 
         _say(describe_info())
@@ -255,18 +255,26 @@ def info(ctx: click.Context) -> NoReturn:
     ctx.exit(_alone(work))
 
 
-def _start_petsc(options: Sequence[str]) -> None:
-    """Start PETSc with the options that count at its start; files are read later, by those who know where to look."""
+def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:
+    """Start PETSc with the options that count at its start, of a run or of none; nothing else reaches it from outside.
+
+    The others are read later, by those who know where to look, but all are judged here. Collective if there is a comm.
+    """
     import petsc4py
 
-    words, given = iter(options), []
-    for word in words:
-        if word == "-options_file":
-            next(words, None)
-        else:
-            given.append(word)
-    # PETSc's signal handler would end a run whose reader has left, or that is asked to stop while it sets up
-    petsc4py.init(["petfsi", "-no_signal_handler", *given])
+    from petfsi import options
+    from petfsi.ranks import on_root
+
+    def read() -> list[str]:
+        return [] if words is None else options.resolve(words, os.environ).starting()
+
+    given = read() if comm is None else on_root(comm, read)
+    hidden = {name: os.environ.pop(name) for name in ("PETSC_OPTIONS", "PETSC_OPTIONS_YAML") if name in os.environ}
+    try:
+        # PETSc's signal handler would end a run whose reader has left, or that is asked to stop while it sets up
+        petsc4py.init(["petfsi", "-skip_petscrc", "-no_signal_handler", *given])
+    finally:
+        os.environ.update(hidden)
 
 
 # ---- how commands end ---------------------------------------------------------------------------------------

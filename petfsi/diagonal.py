@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from petfsi import petsc
+from petfsi import option_database
 from petfsi.newton import Restage, as_it_is
-from petfsi.solve import PREFIX, Outcome
+from petfsi.solve import Outcome
 from petfsi.system import System
 
 
@@ -50,6 +50,6 @@ class DiagonalSolver:
         return Outcome(0, 0.0)
 
     def check_options(self) -> list[str]:
-        """Return the options of others that nothing reads. Collective."""
+        """Return the options that were given and that nothing reads. Collective."""
         self.set_up()
-        return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
+        return [*option_database.unread(), *(option.name for option in option_database.in_force().left_out)]

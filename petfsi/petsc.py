@@ -1,4 +1,4 @@
-"""The one place that knows PETSc's versions, ranks and the life of its options."""
+"""The one place that knows PETSc's versions and ranks."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from numba import njit
 from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 
-from petfsi.errors import InputError
-from petfsi.ranks import on_root
-
 IntType = PETSc.IntType
+#: Codes of errors that numbers make, and no option: a zero pivot, no number, no convergence.
+NUMERICAL = (71, 72, 91)
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def _replace_values(mat: PETSc.Mat, indices: np.ndarray, values: np.ndarray) -> 
     """
     values = np.ascontiguousarray(values, dtype=float)
     if mat.getType() == PETSc.Mat.Type.MPIAIJ:
-        call = _library().MatMPIAIJGetSeqAIJ
+        call = library().MatMPIAIJGetSeqAIJ
         own, others, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
         call.argtypes = [ctypes.c_void_p, *(ctypes.POINTER(ctypes.c_void_p),) * 3]
         if call(mat.handle, ctypes.byref(own), ctypes.byref(others), ctypes.byref(columns)):
@@ -115,7 +114,7 @@ def _overwrite(mat: ctypes.c_void_p, values: np.ndarray) -> None:
     """Replace the entries of a matrix of one rank, in PETSc's own array."""
     place = ctypes.c_void_p()
     for function, work in (("MatSeqAIJGetArray", True), ("MatSeqAIJRestoreArray", False)):
-        call = getattr(_library(), function)
+        call = getattr(library(), function)
         call.argtypes = [ctypes.c_void_p, ctypes.POINTER(ctypes.c_void_p)]
         if call(mat, ctypes.byref(place)):
             raise PETSc.Error
@@ -130,7 +129,7 @@ def collect_garbage() -> None:
 
 def set_mg_residual(pc: PETSc.PC, level: int, operator: PETSc.Mat) -> None:
     """Give a level of PCMG the matrix of its residuals: it keeps that of its first set-up else. Collective."""
-    function = _library().PCMGSetResidual
+    function = library().PCMGSetResidual
     function.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
     if function(pc.handle, level, None, operator.handle):
         raise PETSc.Error
@@ -238,62 +237,14 @@ def _merge(ptr_a, col_a, val_a, ptr_b, col_b, val_b, indptr, indices, values):
     return n
 
 
-# ---- options ------------------------------------------------------------------------------------------------
+# ---- the library and its objects ----------------------------------------------------------------------------
 
 
 @cache
-def _library() -> ctypes.CDLL:
+def library() -> ctypes.CDLL:
     """Return the libpetsc that this process runs; loading a second one by name would crash."""
     maps = Path("/proc/self/maps").read_text().split()
     return ctypes.CDLL(next(word for word in maps if "/libpetsc" in word))
-
-
-def insert_options_file(path: Path) -> None:
-    """Put the options of a file into PETSc's database; later ones win. Collective.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or PETSc does not understand it.
-    """
-    on_root(MPI.COMM_WORLD, lambda: _check_options_file(path))
-    try:
-        PETSc.Options().insertString(f"-options_file {path}")
-    except PETSc.Error as error:
-        raise InputError(f"-options_file {path}: PETSc cannot read it ({error})") from None
-
-
-def _check_options_file(path: Path) -> None:
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "no such file"
-        raise InputError(f"-options_file {path}: {what}; petfsi's own are listed by 'petfsi info'")
-    try:
-        text = path.read_text(errors="replace")
-    except OSError as error:
-        raise InputError(f"-options_file {path}: cannot be read: {error.strerror}") from None
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split("#")[0].split()
-        if words and not words[0].startswith("-"):
-            found = line.strip() if len(line) < 60 else line.strip()[:57] + "..."
-            raise InputError(f"{path}, line {number}: {found!r} is no option; wanted '-name [value]' or '# ...'")
-
-
-def insert_options(args: list[str]) -> None:
-    """Put command-line words into PETSc's database, over what files said. Collective."""
-    if args:
-        PETSc.Options().insertString(" ".join(f'"{word}"' if " " in word else word for word in args))
-
-
-def unread_options(prefix: str) -> list[str]:
-    """Return the names that start with a prefix and that no solver has asked for."""
-    used = ctypes.c_int()
-    library, unread = _library(), []
-    for name in PETSc.Options().getAll():
-        if name.startswith(prefix):
-            library.PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
-            if not used.value:
-                unread.append(name)
-    return sorted(unread)
 
 
 def reason_name(ksp: PETSc.KSP) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
 
-from petfsi import __version__
+from petfsi import __version__, options
 from petfsi.errors import InputError
 from petfsi.plan_fluids import ENTRY_BYTES, KRYLOV_VECTORS, PRECONDITIONER, fluid_plan, fluid_skipped
 from petfsi.scene.fluids import GridInflowSide, MacFluid
@@ -19,7 +20,7 @@ from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 
 #: The options file in force when none is named, and that of large solids alone.
-DEFAULT_OPTIONS, LARGE_OPTIONS = "monolithic.opts", "solid-large.opts"
+DEFAULT_OPTIONS, LARGE_OPTIONS = options.DEFAULT, "solid-large.opts"
 #: Beyond so many unknowns of a solid in 3D multigrid is faster than a factorisation, and needs less memory.
 LARGE = 50_000
 #: Steps of changing length are counted up to here.
@@ -238,14 +239,15 @@ def _bytes(count: float) -> str:
 
 
 def _options(scene: Scene, nodes: dict[str, int], petsc_options: Sequence[str]) -> str:
-    files = [value for name, value in zip(petsc_options, petsc_options[1:], strict=False) if name == "-options_file"]
-    chosen = ", ".join(files) or f"{_default_options(scene, nodes)} (the default)"
-    words = " ".join(petsc_options)
-    for name in files:
-        words = words.replace(f"-options_file {name}", "")
+    default = _default_options(scene, nodes)
+    options.resolve(petsc_options, os.environ, default)
+    given = options.from_words(petsc_options)
+    files = [value for word, value in pairwise([*petsc_options, ""]) if word.lower() == f"-{options.FILE}"]
+    chosen = ", ".join(files) or f"{default} (the default)"
+    over = [*options.from_environment(os.environ), *(o for o in given if o.origin == options.COMMAND_LINE)]
     whole = (scene.fluid is not None and scene.solids) or chosen.startswith(LARGE_OPTIONS)
     coupled = "" if whole else "; of it, what the single field reads"
-    return chosen + coupled + (f"; over it {' '.join(words.split())}" if words.split() else "")
+    return chosen + coupled + (f"; over it {' '.join(map(str, over))}" if over else "")
 
 
 # ---- the installation ---------------------------------------------------------------------------------------
@@ -294,9 +296,7 @@ def _prefixes() -> list[str]:
 
 
 def _options_files() -> list[str]:
-    from petfsi.solve import shipped_options
-
-    files = shipped_options()
+    files = options.shipped_options()
     return ["options files (give the name to -options_file):", *(f"  {p.name:<27}{_first_sentence(p)}" for p in files)]
 
 

@@ -17,6 +17,7 @@ from mpi4py import MPI
 from petfsi import __version__, petsc, solve
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
+from petfsi.options import Options
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
@@ -282,12 +283,12 @@ def run_scene(
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
-    solve.load_options(petsc_args, base=Path(on_root(comm, lambda: default_options(scene))))
+    options = solve.load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
     simulation = Simulation(comm, scene)
     unread = simulation.prepare()
-    files = RunDirectory.create(out, dump_scene(scene), solve.dump_options(), overwrite, comm)
+    files = RunDirectory.create(out, dump_scene(scene), options.dump(), overwrite, comm)
     with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
-        _greet(console, simulation, unread)
+        _greet(console, simulation, options, unread)
         run = Run(simulation, files, console)
         with run.recorded():
             run.open()
@@ -306,7 +307,7 @@ def resume_run(
     stop = Stop(comm, wall_limit)
     files = RunDirectory.open(directory, comm)
     scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
-    solve.load_options(petsc_args, base=files.options)
+    options = solve.load_options(petsc_args, stored=files.options)
     simulation = Simulation(comm, scene)
     with Console(comm.rank, files.log, total=_total(scene, None)) as console:
         found = checkpoints.find_checkpoint(files.checkpoints, comm, console.warn)
@@ -318,7 +319,7 @@ def resume_run(
         unread = simulation.prepare(resumes=True)
         with checkpoints.read_checkpoint(found, comm) as stored:
             simulation.restore(stored.step, stored.time, stored.dt, stored.group)
-        _greet(console, simulation, unread)
+        _greet(console, simulation, options, unread)
         console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
         run = Run(simulation, files, console)
         run.open(after=found.step)
@@ -332,12 +333,12 @@ def _total(scene: Scene, steps: int | None) -> int | None:
     return min(known, default=None)
 
 
-def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
+def _greet(console: Console, simulation: Simulation, options: Options, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = simulation.scene.title or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
-    for note in [*chain.from_iterable(told), *simulation.notes]:
+    for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:
         console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")

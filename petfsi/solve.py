@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import sysconfig
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi import petsc, releases
+from petfsi import option_database, options, petsc, releases
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import PressureFluid
 from petfsi.multigrid import Hierarchy
 from petfsi.newton import Newton, Restage, as_it_is, snes_type
-from petfsi.option_stories import option_story, petsc_text
+from petfsi.option_rules import PREFIX
+from petfsi.option_stories import option_story, petsc_text, unread_story
+from petfsi.options import COMMAND_LINE, DEFAULT, ENVIRONMENT, Options
 from petfsi.pressure_solver import PressureSolver
+from petfsi.ranks import on_root
 from petfsi.system import System, blown_up
-
-#: The solve of a step.
-PREFIX = "fsi_"
-DEFAULT = "monolithic.opts"
 
 #: How Newton's method goes unless options say otherwise. In statics the residual, mostly that of stretch, has to grow
 #: first: thin bodies bend along a narrow valley of their energy, out of which every whole step leads, by EA L^2 / EI.
@@ -46,70 +47,42 @@ def field_prefix(name: str) -> str:
     return f"{PREFIX}fieldsplit_{name}_"
 
 
-def options_directory() -> Path:
-    """Return where the shipped options files are: beside the package in a checkout, else in the installation."""
-    checkout = Path(__file__).parents[1] / "options"
-    return checkout if checkout.is_dir() else Path(sysconfig.get_path("data")) / "share" / "petfsi" / "options"
-
-
-def shipped_options() -> list[Path]:
-    """Return the shipped options files, by name."""
-    return sorted(options_directory().glob("*.opts"))
-
-
-def load_options(args: list[str], base: Path | None = None) -> None:
-    """Fill PETSc's database: an options file, and the command line over it. Collective.
-
-    A ``pc_type`` on the command line takes the place of all that the file says about the preconditioner it replaces.
+def load_options(args: list[str], base: str = DEFAULT, stored: Path | None = None) -> Options:
+    """Fill PETSc's database with what files, PETSC_OPTIONS and the command line say; return it. Collective.
 
     Parameters
     ----------
     args : list of str
         PETSc options as given; ``-options_file`` may name a shipped file without its folder.
-    base : Path, optional
-        The file used when the command line names none; ``monolithic.opts`` by default.
+    base : str
+        The shipped file used when the command line names none.
+    stored : Path, optional
+        The options of a run that goes on: used in place of the shipped file and of PETSC_OPTIONS.
+
+    Raises
+    ------
+    InputError
+        On all ranks, with every option that is refused.
     """
-    default = options_directory() / DEFAULT
-    rest, files = [], []
-    words = iter(args)
-    for word in words:
-        if word == "-options_file":
-            name = next(words, "")
-            if not name:
-                raise InputError("-options_file: wants the name of a file; petfsi's own are listed by 'petfsi info'")
-            files.append(Path(name))
-        else:
-            rest.append(word)
-    for path in files or [base or default]:
-        shipped = options_directory() / path.name
-        petsc.insert_options_file(
-            shipped if not path.exists() and path.parent == Path(".") and shipped.exists() else path
-        )
-    database = PETSc.Options()
-    _make_way(rest, database)
-    petsc.insert_options(rest)
-    for name, value in database.getAll().items():
-        if name.startswith(PREFIX) and name.endswith(VALUED) and not value:
-            raise InputError(f"option -{name}: wants a value behind it")
+
+    def read() -> Options:
+        if stored is not None:
+            return options.resolve_stored(args, os.environ, stored, option_database.fits)
+        return options.resolve(args, os.environ, base, option_database.fits)
+
+    found = on_root(MPI.COMM_WORLD, read)
+    option_database.put(found)
+    return found
 
 
-def _make_way(args: list[str], database: PETSc.Options) -> None:
-    """Drop a file's options of preconditioners that the command line replaces by another type: nothing reads them."""
-    stored = database.getAll()
-    for word, value in zip(args, [*args[1:], ""], strict=False):
-        name = word.lstrip("-")
-        if name.endswith("_pc_type") and stored.get(name) != value:
-            prefix = name.removesuffix("pc_type")
-            for old in stored:
-                if old.startswith(prefix) and not old.startswith((f"{prefix}ksp_", f"{prefix}mat_type")):
-                    database.delValue(old)
+@contextmanager
+def only_options(args: list[str]) -> Iterator[None]:
+    """Have these PETSc options of petfsi's, and no others, in force inside. Collective.
 
-
-def dump_options() -> str:
-    """Return petfsi's options in force, as an options file."""
-    values = PETSc.Options().getAll()
-    lines = [f"-{name} {values[name] or ''}".rstrip() for name in sorted(values) if name.startswith(PREFIX)]
-    return "\n".join(lines) + "\n"
+    Solvers read theirs when they are set up, some when they are first applied, so both must happen inside.
+    """
+    with option_database.only(on_root(MPI.COMM_WORLD, lambda: options.resolve(args, {}, fits=option_database.fits))):
+        yield
 
 
 @dataclass(frozen=True)
@@ -170,6 +143,12 @@ class Solver:
         if not single and mat_type not in ("nest", "aij"):
             raise InputError(f"option -{self.prefix}mat_type {mat_type}: must be nest or aij")
         self.converts = mat_type == "aij" and not single
+        kind = options.getString("pc_type", PETSc.PC.Type.FIELDSPLIT)
+        if not single and not self.converts and kind not in NEST:  # some crash on a nest, before they are refused
+            raise InputError(
+                f"option -{self.prefix}pc_type {kind}: the matrix type nest is for {', '.join(NEST)}; "
+                f"all of the matrix can be factorised with -{self.prefix}mat_type aij"
+            )
         split = options.getString("pc_fieldsplit_type", "multiplicative")
         self.decoupled = not single and splits and split != "schur"
         # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
@@ -464,31 +443,53 @@ class Solver:
         self.system.check_operator()
         self.set_up()
         assert self._ksp is not None
-        if self.iterates:
-            self._iteration()
         try:
+            if self.iterates:
+                self._iteration()
             self._ksp.getPC().apply(self.system.rhs, self.system.residual)
+            if option_database.in_force().given:
+                self._try()
         except PETSc.Error as error:
             raise InputError(option_story(self.prefix, error)) from None
-        absent = tuple(map(field_prefix, {*SHIPPED} - {field.name for field in self.system.fields}))
-        unread = [name for name in petsc.unread_options(PREFIX) if not name.startswith(absent)]
+        self._refuse_unread()
+        return self._unused()
+
+    def _try(self) -> None:
+        """Iterate once, so that what PETSc refuses only when it solves shows now. Collective."""
+        ksp = self._ksp
+        assert ksp is not None
+        most = ksp.getTolerances()[3]
+        ksp.setTolerances(max_it=min(most, 1))
+        try:
+            ksp.solve(self.system.rhs, self.system.residual)
+        except PETSc.Error as error:
+            if error.ierr not in petsc.NUMERICAL:
+                raise
+        finally:
+            ksp.setTolerances(max_it=most)
+
+    def _refuse_unread(self) -> None:
+        unread = [name for name in option_database.unread() if not name.startswith(self._absent())]
         if not self.system.index_sets:  # options of the others wait for a scene that couples
-            others = f"{PREFIX}fieldsplit_" if self.prefix == PREFIX else "-"
-            mine = (self.prefix, f"{PREFIX}snes_")
-            unread = [name for name in unread if name.startswith(mine) and not name.startswith(others)]
+            unread = [name for name in unread if name.startswith(self._mine()) and not name.startswith(self._others())]
         if unread:
-            every = PETSc.Options().getAll()
-            known = sorted(set(COMMON) | {n.removeprefix(self.prefix) for n in every if n not in unread})
-            lines = []
-            for name in unread:
-                prefix = PREFIX if name.startswith(f"{PREFIX}snes_") else self.prefix
-                near = get_close_matches(name.removeprefix(prefix), known, 1)
-                hint = f"; did you mean -{prefix}{near[0]}?" if near else ""
-                if near and f"{prefix}{near[0]}" == name:
-                    hint = f"; it needs -{PREFIX}snes_type newtonls"
-                lines.append(f"option -{name}: no solver of this scene reads it{hint}")
-            raise InputError("\n".join(lines))
-        return [name for name in petsc.unread_options("") if not name.startswith((PREFIX, "options_", "malloc"))]
+            raise InputError(unread_story(unread, self.prefix, [field.name for field in self.system.fields]))
+
+    def _absent(self) -> tuple[str, ...]:
+        """Return how options begin of fields that the scene has not."""
+        return tuple(map(field_prefix, {*SHIPPED} - {field.name for field in self.system.fields}))
+
+    def _mine(self) -> tuple[str, ...]:
+        return self.prefix, f"{PREFIX}snes_"
+
+    def _others(self) -> str:
+        return f"{PREFIX}fieldsplit_" if self.prefix == PREFIX else "-"
+
+    def _unused(self) -> list[str]:
+        """Return what was given for this run, and not in a file for many, and that nothing reads."""
+        now = option_database.in_force()
+        given = [name for name in option_database.unread() if now.chosen[name].origin in (COMMAND_LINE, ENVIRONMENT)]
+        return given + [option.name for option in now.left_out]
 
 
 def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
@@ -497,14 +498,7 @@ def _release(ksp: PETSc.KSP, pressure: PressureSolver | None) -> None:
     ksp.destroy()
 
 
+#: Preconditioners of a matrix in blocks.
+NEST = ("fieldsplit", "jacobi", "none")
 #: Fields that the shipped files have options for, whether they are in a scene or not.
 SHIPPED = ("solid", "pressure", "particles")
-#: How the names of options end that mean nothing without a value.
-VALUED = ("_type", "_rtol", "_atol", "_stol", "_divtol", "_max_it")
-#: Names worth suggesting for a misspelt option, besides those in force.
-COMMON = (
-    "ksp_type ksp_rtol ksp_atol ksp_max_it ksp_monitor ksp_view ksp_pc_side ksp_norm_type "
-    "ksp_initial_guess_nonzero ksp_convergence_test ksp_converged_reason pc_type pc_fieldsplit_type mat_type "
-    "snes_type snes_rtol snes_atol snes_stol snes_max_it snes_monitor snes_linesearch_type snes_converged_reason "
-    "pc_fieldsplit_schur_fact_type pc_fieldsplit_schur_precondition pc_factor_mat_solver_type"
-).split()

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
-from petsc4py import PETSc
 
 from petfsi import solve
 from petfsi.errors import SolveError
@@ -123,7 +119,7 @@ def _solve(system: System, solver: Solver, regions: ClosedRegions | None, fluid:
     try:
         if solver.decoupled and regions is not None:
             solver.reset()
-            with _only_defaults(), regions.coupled():
+            with solve.only_options([]), regions.coupled():
                 other = Solver(system)
                 other.set_up()
                 other.solve_linear(system.rhs, system.solution)
@@ -136,21 +132,3 @@ def _solve(system: System, solver: Solver, regions: ClosedRegions | None, fluid:
         forces = norms[""] <= ROUND_OFF * system.round_off()
         if not (forces and (fluid is None or norms[fluid.name] <= LEFT * norms["rhs"])):
             raise SolveError(f"the velocities at t = 0 cannot be made to fit each other: {error}") from None
-
-
-@contextmanager
-def _only_defaults() -> Iterator[None]:
-    """Have the solver's options of ``solve.DEFAULT`` in force inside, and no others of petfsi's. Collective."""
-    options = PETSc.Options()
-    mine = {name: value for name, value in options.getAll().items() if name.startswith(solve.PREFIX)}
-    for name in mine:
-        options.delValue(name)
-    try:
-        solve.load_options([])
-        yield
-    finally:
-        for name in options.getAll():
-            if name.startswith(solve.PREFIX):
-                options.delValue(name)
-        for name, value in mine.items():
-            options.setValue(name, value)

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,8 +18,8 @@ from mpi4py import MPI
 from processes import environment, launcher
 
 from petfsi.bench.case import job, simulation
+from petfsi.options import shipped_options
 from petfsi.output.history import read_history
-from petfsi.solve import shipped_options
 
 SCENES = Path(__file__).parent / "scenes"
 BAR = SCENES / "bar2d.toml"
@@ -214,15 +215,16 @@ def test_any_number_of_ranks_gives_the_same_history(tmp_path):
 @pytest.mark.parametrize("options", shipped_options(), ids=lambda path: path.stem)
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_every_option_of_a_shipped_file_is_read_and_converged_schemes_agree(options, ranks, tmp_path):
-    # an option that nothing reads would end the run; so heavy a bar lets the iterated splitting converge
+    # an option of one's own file that nothing reads ends the run; so heavy a bar lets the iterated splitting converge
+    options = shutil.copy(options, tmp_path / f"own-{options.name}")
     heavy = ("--set", "solids.bar.density=5000", "--set", "output={}", "--steps", 3)
-    if options.stem == "solid-large":  # of solids alone
+    if "solid-large" in options.name:  # of solids alone
         petfsi(
             "run", SCENES / "beam.toml", "--out", tmp_path / "run", "--steps", 3, "-options_file", options, ranks=ranks
         )
         return
     petfsi("run", BAR, "--out", tmp_path / "run", *heavy, "-options_file", options, ranks=ranks)
-    if options.stem == "split":
+    if options.name == "own-split.opts":
         return  # its answer is another one: see test_splitting
     petfsi("run", BAR, "--out", tmp_path / "direct", *heavy, "-options_file", "monolithic-direct.opts")
     got, want = (read_history(tmp_path / name / "history.csv")["tip.x"][-1] for name in ("run", "direct"))

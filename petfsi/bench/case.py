@@ -14,12 +14,12 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi import solve
 from petfsi.errors import InputError
 from petfsi.ranks import on_root
 from petfsi.scene.load import apply_set, scene_from_dict
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
+from petfsi.solve import only_options
 
 MONOLITHIC, SPLIT, ITERATED = "monolithic.opts", "split.opts", "split-iterated.opts"
 DIRECT = "monolithic-direct.opts"
@@ -63,27 +63,6 @@ def _put(data: Any, key: str, value: Any) -> None:
     for part in tables:
         data = data[int(part) if isinstance(data, list) else part]
     data[int(last) if isinstance(data, list) else last] = value
-
-
-@contextmanager
-def only_options(args: list[str]) -> Iterator[None]:
-    """Have these PETSc options of petfsi's, and no others, in force inside. Collective.
-
-    Solvers read theirs when they are set up, some when they are first applied, so both must happen inside.
-    """
-    _clear()
-    try:
-        solve.load_options(args)
-        yield
-    finally:
-        _clear()
-
-
-def _clear() -> None:
-    options = PETSc.Options()
-    for name in options.getAll():
-        if name.startswith(solve.PREFIX):
-            options.delValue(name)
 
 
 @contextmanager

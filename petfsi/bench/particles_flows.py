@@ -9,10 +9,11 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.bench import theory
-from petfsi.bench.case import Case, only_options
+from petfsi.bench.case import Case
 from petfsi.bench.particles_runs import box, largest, owned, particles, prepared, total, watched
 from petfsi.bench.report import Report, Row
 from petfsi.simulation import Simulation
+from petfsi.solve import only_options
 
 # ---- vortices that decay ----------------------------------------------------------------------------------------
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.bench.case import only_options
 from petfsi.fields.sph.fluid import SphFluid
 from petfsi.ranks import on_root
 from petfsi.scene.load import scene_from_dict
 from petfsi.simulation import Simulation
+from petfsi.solve import only_options
 
 G, DENSITY = 9.81, 1000.0
 

@@ -23,11 +23,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from petfsi import petsc
-from petfsi.bench.case import DIRECT, MONOLITHIC, SPLIT, Case, job, only_options
+from petfsi.bench.case import DIRECT, MONOLITHIC, SPLIT, Case, job
 from petfsi.bench.report import Report, Row
 from petfsi.errors import SolveError
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
+from petfsi.solve import only_options
 
 PAPER = "monolithic-paper.opts"
 TOLERANCE = 1e-8
