@@ -17,14 +17,16 @@ from mpi4py import MPI
 from petfsi import __version__, petsc, solve
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
+from petfsi.messages import shown
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
-from petfsi.plan import MAX_COUNTED, default_options, skipped
+from petfsi.plan import MAX_COUNTED, skipped
 from petfsi.ranks import on_root
+from petfsi.ready import made_ready
 from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
@@ -282,9 +284,7 @@ def run_scene(
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
-    solve.load_options(petsc_args, base=Path(on_root(comm, lambda: default_options(scene))))
-    simulation = Simulation(comm, scene)
-    unread = simulation.prepare()
+    simulation, unread = made_ready(comm, scene, petsc_args)
     files = RunDirectory.create(out, dump_scene(scene), solve.dump_options(), overwrite, comm)
     with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
         _greet(console, simulation, unread)
@@ -334,7 +334,7 @@ def _total(scene: Scene, steps: int | None) -> int | None:
 
 def _greet(console: Console, simulation: Simulation, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
-    title = simulation.scene.title or "untitled"
+    title = shown(simulation.scene.title, 200) or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
     for note in [*chain.from_iterable(told), *simulation.notes]:
