@@ -16,6 +16,7 @@ import click
 
 from petfsi import __version__
 from petfsi.errors import PetfsiError
+from petfsi.messages import screen, shown
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -158,15 +159,22 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
     def work() -> int:
         import numpy as np
 
-        from petfsi.plan import describe_plan, judge_first_step, may_lack_a_solution
+        from petfsi.memory import refuse_too_large
+        from petfsi.plan import describe_plan, is_rehearsed
         from petfsi.scene.load import load_scene
 
+        petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
+        refuse_too_large(loaded)
         with np.errstate(all="ignore"):  # what overflows is told of by those who judge what it gives
-            plan = describe_plan(loaded, ctx.meta["petsc"])
-            if may_lack_a_solution(loaded):
-                _start_petsc()
-                judge_first_step(loaded)
+            plan = describe_plan(loaded, petsc)
+            if is_rehearsed(loaded):
+                _start_petsc(petsc)
+                from mpi4py import MPI
+
+                from petfsi.ready import made_ready
+
+                made_ready(MPI.COMM_SELF, loaded, petsc)
         _say(plan)
         return 0
 
@@ -357,14 +365,14 @@ def _verdict(error: BaseException) -> tuple[int, str]:
 
 def _verdict_in_short(error: BaseException) -> tuple[int, str]:
     if isinstance(error, PetfsiError):
-        return error.exit_code, str(error)
+        return error.exit_code, screen(str(error), first=len("petfsi: "))
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"
     if isinstance(error, MemoryError):
         return 1, "the machine's memory is used up; 'petfsi check' estimates what a scene needs"
     if isinstance(error, OSError) and error.errno in MACHINE:
-        return 1, f"{error.filename or 'a file'}: {error.strerror}"
-    what = " ".join(str(error).split())[:300]
+        return 1, f"{shown(error.filename or 'a file', 200)}: {error.strerror}"
+    what = shown(" ".join(str(error).split()), 300)
     return 1, (
         f"{type(error).__name__}: {what} (at {_place(error)}); this is a defect in petfsi; "
         "set PETFSI_TRACEBACK=1 and run again to see where it comes from"
@@ -386,6 +394,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return cli.main(args=arguments, prog_name="petfsi", standalone_mode=False) or 0
     except click.ClickException as error:
         if _launched_rank() == 0:
+            error.__dict__["message"] = screen(error.message)
             error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):

@@ -14,8 +14,9 @@ import numpy as np
 
 from petfsi import __version__, options
 from petfsi.errors import InputError
-from petfsi.plan_fluids import ENTRY_BYTES, KRYLOV_VECTORS, PRECONDITIONER, fluid_plan, fluid_skipped
-from petfsi.scene.fluids import GridInflowSide, MacFluid
+from petfsi.memory import PROGRAM_BYTES, as_bytes, available_bytes, needs, solid_bytes
+from petfsi.messages import shown
+from petfsi.plan_fluids import fluid_plan, fluid_skipped
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 
@@ -25,10 +26,8 @@ DEFAULT_OPTIONS, LARGE_OPTIONS = options.DEFAULT, "solid-large.opts"
 LARGE = 50_000
 #: Steps of changing length are counted up to here.
 MAX_COUNTED = 100_000
-#: Cells of a grid up to which the first step of its fluid is assembled to see whether it has a solution.
-JUDGED = 1_000_000
-#: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.
-PROGRAM_BYTES = 250e6
+#: A scene of no more bytes and solids is made ready by ``check``.
+REHEARSED, MANY = 1e9, 300
 
 PACKAGES = (
     "mumps superlu superlu_dist suitesparse mkl_pardiso strumpack hypre ml scalapack metis parmetis ptscotch "
@@ -52,8 +51,16 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
         With every mistake in its mesh files.
     """
     nodes, cells = _solid_sizes(scene)
-    lines = [scene.title or "untitled", ""]
+    if not is_rehearsed(scene) and any(probe.of in scene.solids for probe in scene.probes.values()):
+        from petfsi.geometry.bodies import far_probes
+
+        wrong = far_probes(scene)
+        if wrong:
+            raise InputError("\n".join(wrong))
+    lines = [shown(scene.title, 200) or "untitled", ""]
     lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, nodes, cells)]
+    if not is_rehearsed(scene):
+        lines.append(f"{'first step:':<13}too large to be made ready here: run judges it before it writes anything")
     lines += [f"{'options:':<13}{_options(scene, nodes, petsc_options)}", "", "skipped:"]
     return "\n".join([*lines, *(f"  {line}" for line in skipped(scene))])
 
@@ -102,36 +109,9 @@ def skipped(scene: Scene) -> list[str]:
     return out
 
 
-def may_lack_a_solution(scene: Scene) -> bool:
-    """Return whether it takes the first step's equations to know that they have a solution.
-
-    Of a fluid with so many cells that it would take long this is left to the run.
-    """
-    fluid = scene.fluid
-    if fluid is None:
-        return scene.time.integrator == "static"
-    if not isinstance(fluid, MacFluid) or math.prod(fluid.cells) > JUDGED:
-        return False
-    inflows = [form.inflow for _, form in fluid.sides if isinstance(form, GridInflowSide)]
-    supports = [support for solid in scene.solids.values() for support in solid.supports]
-    moves = any(support.velocity or support.displacement for support in supports)
-    leaves = any(form == "open" for _, form in fluid.sides) or any(inflow.rest == "open" for inflow in inflows)
-    return (bool(inflows) or moves) and (not leaves or bool(scene.solids) or bool(scene.obstacles))
-
-
-def judge_first_step(scene: Scene) -> None:
-    """Assemble the first step. Not collective.
-
-    Raises
-    ------
-    InputError
-        If it has no solution, or what is assembled cannot be built.
-    """
-    from mpi4py import MPI
-
-    from petfsi.simulation import Simulation
-
-    Simulation(MPI.COMM_SELF, scene).rehearse()
+def is_rehearsed(scene: Scene) -> bool:
+    """Return whether ``check`` makes all ready for the first step, as ``run`` does: not what would take long."""
+    return sum(need for *_, need in needs(scene)) <= REHEARSED and len(scene.solids) <= MANY
 
 
 def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> list[tuple[str, str]]:
@@ -143,9 +123,12 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
         bodies = "; ".join(f"{name} {nodes[name]:,} nodes, {cells[name]:,} cells" for name in nodes)
         rows.append(("solid", f"{n:,} unknowns ({bodies})"))
     rows.append(("in all", f"{unknowns:,} unknowns"))
-    memory = fluid.bytes + _solid_bytes(scene.dim, sum(nodes.values()), sum(cells.values()))
+    memory = fluid.bytes + solid_bytes(scene.dim, sum(nodes.values()), sum(cells.values()))
     more = "; much more where a large 3D solid is factorised" if nodes and scene.dim == 3 else ""
-    rows.append(("memory", f"about {_bytes(memory)}, and {_bytes(PROGRAM_BYTES)} a rank for the program{more}"))
+    program, free = as_bytes(PROGRAM_BYTES), as_bytes(available_bytes())
+    rows.append(
+        ("memory", f"about {as_bytes(memory)}, and {program} a rank for the program{more}; {free} are free here")
+    )
     time = scene.time
     steps = Stepping(time).count(MAX_COUNTED)
     number = f"{steps:,}" if steps is not None else "many"
@@ -156,7 +139,7 @@ def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> l
     if scene.output.every is not None:
         times = min(_count(time.end, scene.output.every), steps or MAX_COUNTED) + 1
         size = times * (fluid.output_bytes + 16 * scene.dim * sum(nodes.values()))
-        rows.append(("outputs", f"{times:,}, every {scene.output.every:g} s, about {_bytes(size)} in all"))
+        rows.append(("outputs", f"{times:,}, every {scene.output.every:g} s, about {as_bytes(size)} in all"))
     every = scene.checkpoint.every
     written = 1 if every is None else min(_count(time.end, every), steps or MAX_COUNTED)
     rows.append(("checkpoints", f"{written:,}, of which the last {min(written, scene.checkpoint.keep)} stay"))
@@ -220,22 +203,6 @@ def _plain_cells(solid: Solid) -> list[int] | None:
     if shape.ball is not None and shape.ball.cells is not None:
         return [shape.ball.cells] * len(shape.ball.centre)
     return shape.box.cells if shape.box is not None else None
-
-
-def _solid_bytes(dim: int, nodes: int, cells: int) -> float:
-    """Return an estimate of what all ranks hold of solids: state, matrices, preconditioner, Krylov vectors."""
-    neighbours = 7 if dim == 2 else 15
-    matrix = ENTRY_BYTES * dim**2 * neighbours * (1 + PRECONDITIONER)
-    # an element keeps where its matrix goes, the matrix while it is assembled, and its gradients
-    return nodes * (matrix + 8 * dim * KRYLOV_VECTORS) + cells * (16 * (dim * (dim + 1)) ** 2 + 8 * dim * (dim + 1))
-
-
-def _bytes(count: float) -> str:
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} TB"
 
 
 def _options(scene: Scene, nodes: dict[str, int], petsc_options: Sequence[str]) -> str:

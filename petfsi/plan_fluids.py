@@ -66,11 +66,15 @@ def _mac(scene: Scene) -> FluidPlan:
     n = math.prod(fluid.cells)
     rows = [("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, fluid.cells))}")]
     rows += [("note", note) for note in side_notes(scene)]
+    per_output = 8 * (dim + 2 + (fluid.smoke is not None))
+    return FluidPlan(rows, n, grid_bytes(fluid, dim), float(n * per_output), _mac_skipped(scene))
+
+
+def grid_bytes(fluid: MacFluid, dim: int) -> float:
+    """Return what a grid takes on all ranks together, bytes."""
     arrays = 8 * (4 * dim + 4) + dim + 5 + (16 if fluid.smoke is not None else 0)
     matrix = ENTRY_BYTES * (2 * dim + 1) * (1 + PRECONDITIONER)
-    per_output = 8 * (dim + 2 + (fluid.smoke is not None))
-    size = float(n * (arrays + matrix + 8 * KRYLOV_VECTORS))
-    return FluidPlan(rows, n, size, float(n * per_output), _mac_skipped(scene))
+    return float(math.prod(fluid.cells) * (arrays + matrix + 8 * KRYLOV_VECTORS))
 
 
 def _mac_skipped(scene: Scene) -> list[str]:

@@ -17,6 +17,7 @@ from mpi4py import MPI
 from petfsi import __version__, petsc, solve
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
+from petfsi.messages import shown
 from petfsi.options import Options
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
@@ -24,8 +25,9 @@ from petfsi.output.history import History, column_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
-from petfsi.plan import MAX_COUNTED, default_options, skipped
+from petfsi.plan import MAX_COUNTED, skipped
 from petfsi.ranks import on_root
+from petfsi.ready import made_ready
 from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
@@ -283,9 +285,7 @@ def run_scene(
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
-    options = solve.load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
-    simulation = Simulation(comm, scene)
-    unread = simulation.prepare()
+    simulation, unread, options = made_ready(comm, scene, petsc_args)
     files = RunDirectory.create(out, dump_scene(scene), options.dump(), overwrite, comm)
     with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
         _greet(console, simulation, options, unread)
@@ -335,7 +335,7 @@ def _total(scene: Scene, steps: int | None) -> int | None:
 
 def _greet(console: Console, simulation: Simulation, options: Options, unread: list[str]) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
-    title = simulation.scene.title or "untitled"
+    title = shown(simulation.scene.title, 200) or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
     for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:

@@ -394,7 +394,10 @@ class Simulation:
 
     def _probe_values(self, measure: Callable) -> Iterator[tuple[str, float]]:
         for name, spec in self.scene.probes.items():
-            value = measure(spec.of, spec.at, spec.quantity)
+            try:
+                value = measure(spec.of, spec.at, spec.quantity)
+            except InputError as error:
+                raise InputError(f"probes.{name}: {error}") from None
             if spec.quantity in SCALARS:
                 yield name, float(np.ravel(value)[0])
             else:

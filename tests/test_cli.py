@@ -192,8 +192,9 @@ def test_help_costs_no_heavy_import():
         assert name not in modules
 
 
-def test_check_starts_neither_petsc_nor_mpi(scene):
-    code = f"import sys; from petfsi import cli; cli.main(['check', {str(scene)!r}]); print(sorted(sys.modules))"
+def test_a_mistake_is_told_before_petsc_and_mpi_start(scene):
+    words = ["check", str(scene), "--set", "time.dt=fast"]
+    code = f"import sys; from petfsi import cli; cli.main({words!r}); print(sorted(sys.modules))"
     modules = petfsi(code=code).stdout.splitlines()[-1]
     assert "'pydantic'" in modules
     for name in ("'petsc4py.PETSc'", "'mpi4py.MPI'", "'numba'", "'matplotlib'"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -34,14 +35,21 @@ def ball_mesh(ball: Ball, dim: int) -> tuple[np.ndarray, np.ndarray]:
     """
     assert ball.cells is not None
     points, cells = unit_ball(dim, ball.cells)
-    return np.array(ball.centre) + ball.radius * points, cells
+    return np.array(ball.centre) + ball.radius * points, cells.copy()
 
 
+@lru_cache(maxsize=2)
 def unit_ball(dim: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and cells of the ball of radius 1 around the origin, ``n`` cells along each axis."""
+    """Return points and cells of the ball of radius 1 around the origin, ``n`` cells along each axis.
+
+    They are kept for the next one, many bodies being alike: neither may be changed.
+    """
     line = (2.0 * np.arange(n + 1) - n) / n
     cube = np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
-    return _rounded(cube), _cells(dim, n)
+    points, cells = _rounded(cube), _cells(dim, n)
+    for array in (points, cells):
+        array.flags.writeable = False
+    return points, cells
 
 
 def _rounded(cube: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
 
 import numpy as np
 from numba import njit
@@ -16,7 +15,7 @@ from petfsi.geometry.shapes import bounds, inside
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.scene.checks import check_inside_grid
 from petfsi.scene.schema import Obstacle, Scene, Solid
-from petfsi.scene.shape_checks import images, periods
+from petfsi.scene.shape_checks import images, may_meet, periods
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -78,6 +77,22 @@ def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
         except InputError as error:
             mistakes.append(str(error))
     return mistakes
+
+
+def far_probes(scene: Scene) -> list[str]:
+    """Return a sentence for every probe of a solid that lies far outside it. Not collective; builds what is probed."""
+    found, meshes = [], {}
+    for name, probe in scene.probes.items():
+        solid = scene.solids.get(probe.of)
+        if solid is None or probe.at is None or solid.shape.beam is not None:
+            continue
+        if probe.of not in meshes:
+            meshes[probe.of] = build_mesh(solid, scene.dim, f"solids.{probe.of}", scene.directory)
+        try:
+            _check_near(np.array(probe.at), meshes[probe.of], f"probes.{name}")
+        except InputError as error:
+            found.append(str(error))
+    return found
 
 
 def _check_near(at: np.ndarray, mesh: Mesh, key: str) -> None:
@@ -152,9 +167,13 @@ def _covers(obstacle: Obstacle, points: np.ndarray, scene: Scene, key: str) -> n
 def _in_each_other(meshes: dict[str, Mesh], period: np.ndarray) -> list[str]:
     """Return a sentence for every pair of bodies that share material, or whose images do."""
     found = []
-    for first, second in combinations(meshes, 2):
+    names = list(meshes)
+    lows = np.array([points.min(axis=0) for points, _ in meshes.values()]).reshape(-1, len(period))
+    highs = np.array([points.max(axis=0) for points, _ in meshes.values()]).reshape(-1, len(period))
+    for i, j in may_meet(lows, highs, period):
+        first, second = names[i], names[j]
         (points, cells), other = meshes[first], meshes[second]
-        reach, other_reach = ((p.min(axis=0), p.max(axis=0)) for p in (points, other[0]))
+        reach, other_reach = (lows[i], highs[i]), (lows[j], highs[j])
         pairs = [((points + shift, cells), other) for shift in images(period, reach, other_reach)]
         count = sum(_covered_cells(*pair) + _covered_cells(*reversed(pair)) for pair in pairs)
         if count or any(_cross(*pair) for pair in pairs):

@@ -19,6 +19,7 @@ from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
+from petfsi.messages import shown
 from petfsi.scene.schema import Solid
 from petfsi.scene.tables import Box, Shape
 
@@ -229,7 +230,7 @@ def open_mesh(shape: Shape, key: str, directory: Path) -> meshio.Mesh:
             return meshio.read(path)
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"{key} = {shape.mesh!r}: cannot be read as a mesh ({error or type(error).__name__})"
+            f"{key} = {shape.mesh!r}: cannot be read as a mesh ({shown(error, 200) or type(error).__name__})"
         ) from error
 
 
@@ -238,7 +239,7 @@ def _read(shape: Shape, dim: int, cell_type: str, key: str, directory: Path) -> 
     mesh = open_mesh(shape, key, directory)
     blocks = [block.data for block in mesh.cells if block.type == cell_type and len(block.data)]
     if not blocks:
-        found = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells at all"
+        found = shown(", ".join(sorted({block.type for block in mesh.cells})), 200) or "no cells at all"
         raise InputError(f"{key} = {shape.mesh!r}: holds no {cell_type} cells, which dim = {dim} wants; found {found}")
     cells = np.concatenate(blocks).astype(np.int64)
     points = _as_dim(np.asarray(mesh.points, dtype=float), dim, f"{key} = {shape.mesh!r}")

@@ -327,7 +327,7 @@ def _cylinder(
     rows = max(1, math.ceil(length / spacing))
     _refuse_many(4 * across**2 + 8 * across * rows, cylinder.radius, key)
     disk, cells = unit_ball(2, across)
-    disk *= cylinder.radius * math.sqrt(np.pi / _enclosed_volume(disk, boundary_facets(disk, cells)))
+    disk = disk * (cylinder.radius * math.sqrt(np.pi / _enclosed_volume(disk, boundary_facets(disk, cells))))
     axes = _frame((end - start) / length)
     rim = boundary_facets(disk, cells)
     rim = rim[np.argsort(np.arctan2(*disk[rim[:, 0]].T[::-1])), 0]

@@ -10,6 +10,7 @@ from petfsi.errors import InputError
 from petfsi.geometry.meshes import CELL_TYPE, FACET_TYPE, open_mesh
 from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.shapes import inside
+from petfsi.messages import shown
 from petfsi.scene.schema import Solid, Tagged
 from petfsi.scene.tables import Shape
 
@@ -149,7 +150,7 @@ def located_facets(
 
 def _tagged(where: Tagged, key: str, tags: Tags) -> np.ndarray:
     if where.tag not in tags:
-        known = ", ".join(sorted(tags)) or "none at all"
+        known = shown(", ".join(sorted(tags)), 300) or "none at all"
         raise InputError(f"{key}.where.tag = {where.tag!r}: the mesh file has no such group of facets; it has {known}")
     facets = tags[where.tag]
     return facets[(facets >= 0).all(axis=1)]

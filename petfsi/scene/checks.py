@@ -6,12 +6,14 @@ The schema has judged each value by itself by now, so types and signs are right 
 from __future__ import annotations
 
 import re
+import stat
 from collections.abc import Callable, Iterator, Sequence
-from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
 from petfsi.errors import InputError
+from petfsi.messages import shown
 from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.fluids import (
@@ -28,6 +30,7 @@ from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.particle_checks import particles
 from petfsi.scene.probe_checks import probes
+from petfsi.scene.scale_checks import scales
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.shape_checks import (
     NO_Z,
@@ -38,6 +41,7 @@ from petfsi.scene.shape_checks import (
     images,
     is_measured,
     length,
+    may_meet,
     outside_grid,
     overlap,
     periods,
@@ -50,6 +54,8 @@ from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Halfspace
 
 MAX_STEPS = 10**8
+#: Characters of a file's name that are shown.
+LONGEST = 300
 
 #: Columns of history.csv, which a probe must not repeat.
 RESERVED_PROBES = (
@@ -61,7 +67,10 @@ RESERVED_PROBES = (
 
 def problems(scene: Scene) -> list[Problem]:
     """Return every mistake that shows only when several settings are seen together."""
-    return [problem for check in CHECKS for problem in check(scene)]
+    with np.errstate(all="ignore"):  # what overflows is told by the last of them
+        found = [problem for check in CHECKS for problem in check(scene)]
+        told = {problem.key for problem in found}
+        return found + [problem for problem in scales(scene) if problem.key not in told]
 
 
 def check_inside_grid(scene: Scene, key: str, points: np.ndarray) -> None:
@@ -204,9 +213,23 @@ def _mesh_files(scene: Scene) -> Problems:
     for table in ("solids", "obstacles"):
         for name, item in getattr(scene, table).items():
             mesh = item.shape.mesh
-            if item.shape.kinds == ["mesh"] and not (scene.directory / mesh).is_file():
-                # in full, where a value would be shortened: a file's name stands at the end
-                yield Problem(f"{table}.{name}.shape.mesh", ABSENT, f"no such file: {mesh}")
+            if item.shape.kinds == ["mesh"] and (why := unreadable(scene.directory / mesh)):
+                # nearly in full, where a value would be shortened
+                yield Problem(f"{table}.{name}.shape.mesh", ABSENT, f"{why}: {shown(mesh, LONGEST)}")
+
+
+def unreadable(path: Path) -> str:
+    """Return why a file cannot be read, or nothing."""
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            return "is no file but a folder" if stat.S_ISDIR(mode) else "is no file but a device or a pipe"
+        with path.open("rb"):
+            return ""
+    except FileNotFoundError:
+        return "no such file"
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
 
 
 def _obstacles(scene: Scene) -> Problems:
@@ -276,16 +299,16 @@ def _supports(key: str, solid: Solid, dim: int) -> Problems:
 def _overlaps(scene: Scene) -> Problems:
     """Refuse boxes and balls that share material: no body may start inside another."""
     whole = [
-        (name, solid.shape)
+        (name, solid.shape, reach)
         for name, solid in scene.solids.items()
-        if solid.shape.cavity is None and extent(solid.shape, scene.dim) is not None
+        if solid.shape.cavity is None and (reach := extent(solid.shape, scene.dim)) is not None
     ]
-    period = periods(scene.fluid, scene.dim) if scene.fluid is None or is_measured(scene.fluid, scene.dim) else None
-    for (first, a), (second, b) in combinations(whole, 2):
-        reach, other = extent(a, scene.dim), extent(b, scene.dim)
-        assert reach is not None and other is not None
-        moves = [np.zeros(scene.dim)] if period is None else images(period, reach, other)
-        if any(overlap(a, b, scene.dim, shift) for shift in moves):
+    measured = scene.fluid is None or is_measured(scene.fluid, scene.dim)
+    period = periods(scene.fluid, scene.dim) if measured else np.zeros(scene.dim)
+    corners = np.array([reach for *_, reach in whole], dtype=float).reshape(-1, 2, scene.dim)
+    for i, j in may_meet(corners[:, 0], corners[:, 1], period):
+        (first, a, reach), (second, b, other) = whole[i], whole[j]
+        if any(overlap(a, b, scene.dim, shift) for shift in images(period, reach, other)):
             allowed = f"overlaps solids.{first}; bodies must lie apart"
             yield Problem(f"solids.{second}.shape.{b.kinds[0]}", ABSENT, allowed, (f"solids.{first}.shape",))
 

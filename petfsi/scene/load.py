@@ -11,9 +11,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from petfsi.errors import InputError
+from petfsi.messages import shown
 from petfsi.scene import checks, mistakes
 from petfsi.scene.dump import dump_scene
 from petfsi.scene.mistakes import Problem
+from petfsi.scene.raw import MAX_DEPTH, judge_raw, read_raw
 from petfsi.scene.schema import Scene
 
 __all__ = ["RESUMABLE", "apply_set", "dump_scene", "load_scene", "parse_value", "scene_from_dict"]
@@ -21,7 +23,10 @@ __all__ = ["RESUMABLE", "apply_set", "dump_scene", "load_scene", "parse_value", 
 #: What may be changed when a run is resumed: nothing that the state at hand depends on.
 RESUMABLE = ("time.end", "time.energy_limit", "output", "checkpoint")
 
-MAX_LINES = 40
+#: Characters of a file's name, or a setting, that are shown.
+LONGEST = 200
+#: Mistakes that are told, on a screen; of the others the number.
+MAX_LINES = 20
 
 
 def load_scene(path: Path | str, sets: Sequence[str] = (), only: Sequence[str] | None = None) -> Scene:
@@ -42,30 +47,16 @@ def load_scene(path: Path | str, sets: Sequence[str] = (), only: Sequence[str] |
         With every mistake in the scene: its key, its value and what is allowed.
     """
     path = Path(path)
-    data = _read(path)
+    data = read_raw(path)
     for setting in sets:
         apply_set(data, setting, only)
-    return _validate(data, path.parent, str(path))
+    return _validate(data, path.parent, shown(path, LONGEST))
 
 
 def scene_from_dict(data: dict[str, Any], directory: Path | str = Path()) -> Scene:
     """Return the scene that a dictionary says, judged like a file in ``directory``."""
+    judge_raw(data, "scene")
     return _validate(copy.deepcopy(data), Path(directory), "scene")
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; a scene is a TOML file") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; a scene is a TOML file (a run folder is for 'petfsi resume')") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); a scene is a TOML file") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
 # ---- --set --------------------------------------------------------------------------------------------------
@@ -74,6 +65,7 @@ def _read(path: Path) -> dict[str, Any]:
 def apply_set(data: dict[str, Any], setting: str, only: Sequence[str] | None = None) -> None:
     """Put one ``a.b.c=value`` into the raw scene; missing tables are made, list items count from 0."""
     key, separator, text = setting.partition("=")
+    setting = shown(setting, LONGEST)
     key = key.strip()
     parts = key.split(".")
     if not separator or not all(parts):
@@ -81,27 +73,40 @@ def apply_set(data: dict[str, Any], setting: str, only: Sequence[str] | None = N
     if only is not None and not any(parts[: len(o.split("."))] == o.split(".") for o in only):
         raise InputError(f"--set {setting}: here only {', '.join(only)} may be changed; for the rest start a new run")
     holder: Any = data
+    if len(parts) > MAX_DEPTH:
+        raise InputError(f"--set {setting}: tables are nested no deeper than {MAX_DEPTH} levels")
     for n, part in enumerate(parts):
         path = ".".join(parts[:n])
         if isinstance(holder, list):
             if not (part.isascii() and part.isdigit() and int(part) < len(holder)):
                 raise InputError(f"--set {setting}: {path} is a list; its items are numbered 0 to {len(holder) - 1}")
         elif not isinstance(holder, dict):
-            raise InputError(f"--set {setting}: {path} is {mistakes.shorten(holder)}, not a table")
+            raise InputError(f"--set {setting}: {path} is {shown(holder)}, not a table")
         index = int(part) if isinstance(holder, list) else part
         if n == len(parts) - 1:
-            holder[index] = parse_value(text.strip())
+            holder[index] = parse_value(text.strip(), f"--set {setting}")
         else:
             holder = holder.setdefault(index, {}) if isinstance(holder, dict) else holder[index]
 
 
-def parse_value(text: str) -> Any:
-    """Return a TOML value, or the text itself where it is none, so that quotes need not survive a shell."""
+def parse_value(text: str, source: str = "value") -> Any:
+    """Return a TOML value, or the text itself where it is none, so that quotes need not survive a shell.
+
+    Raises
+    ------
+    InputError
+        If it holds what no scene does (see ``raw.py``); the message begins with ``source``.
+    """
     try:
         parsed = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return text
-    return parsed["value"] if parsed.keys() == {"value"} else text
+    except tomllib.TOMLDecodeError:
+        parsed = {}
+    except (ValueError, RecursionError, OverflowError):
+        raise InputError(f"{source}: holds a number of too many digits, or is nested too deep") from None
+    if parsed.keys() != {"value"}:
+        parsed = {"value": text}
+    judge_raw(parsed, source)
+    return parsed["value"]
 
 
 # ---- judging ------------------------------------------------------------------------------------------------

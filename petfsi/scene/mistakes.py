@@ -11,10 +11,13 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from petfsi.messages import shown
 from petfsi.scene.schema import Scene
 
 #: No value stands at the key.
 ABSENT = object()
+#: Characters of a key that are shown.
+LONGEST = 100
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Problem:
 
     def __str__(self) -> str:
         value = "" if self.value is ABSENT else f" = {shorten(self.value)}"
-        return f"{self.key}{value}: {self.allowed}"
+        return f"{shown(self.key, LONGEST)}{value}: {self.allowed}"
 
     def follows_from(self, wrong: Iterable[str]) -> bool:
         """Whether one of the keys it rests on, or one inside or around them, is known to be wrong."""
@@ -54,9 +57,7 @@ def _overlap(a: str, b: str) -> bool:
 
 def shorten(value: Any) -> str:
     """Return a value on one line of bounded length."""
-    text = f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
-    text = " ".join(text.split())
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shown(f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else value)
 
 
 # ---- from pydantic ------------------------------------------------------------------------------------------
@@ -119,6 +120,7 @@ def _is_form(part: Any) -> bool:
 def _unknown(loc: list[Any]) -> str:
     """Say that there is no such setting, and which one may be meant: beside it, or else in another table."""
     name, table = str(loc[-1]), _model(loc[:-1])
+    given = shown(name)
     fields = _settings(table) if table is not None else {}
     others = _walk([part for part in loc[:-1] if not _is_form(part)])[0]
     kinds = [kind for kind in others if _is_model(kind) and "kind" in _settings(kind)]
@@ -128,15 +130,15 @@ def _unknown(loc: list[Any]) -> str:
     near = difflib.get_close_matches(name, fields, 1)
     if near:
         unit = fields[near[0]].description
-        return f"no setting '{name}'; did you mean '{near[0]}'" + (f" ({unit})?" if unit else "?")
+        return f"no setting '{given}'; did you mean '{near[0]}'" + (f" ({unit})?" if unit else "?")
     elsewhere = [path for path in _every_setting(Scene) if path[-1] == name]
     if tuple(part for part in loc if not _is_form(part)) in elsewhere:  # of another form of this table
         return f"does not belong here; known here are {', '.join(fields)}"
     if elsewhere and len(elsewhere[0]) == 1:
-        return f"no setting '{name}' here; it stands at the top of the scene, before any [table]"
+        return f"no setting '{given}' here; it stands at the top of the scene, before any [table]"
     if elsewhere:
-        return f"no setting '{name}' here; did you mean '{'.'.join(elsewhere[0])}'?"
-    return f"no setting '{name}'; known here are {', '.join(fields)}"
+        return f"no setting '{given}' here; did you mean '{'.'.join(elsewhere[0])}'?"
+    return f"no setting '{given}'; known here are {', '.join(fields)}"
 
 
 def _settings(model: type[BaseModel]) -> dict[str, FieldInfo]:

@@ -17,6 +17,9 @@ MAX_CELLS = 2**31 - 1
 #: Bodies may touch the grid's sides and each other; this fraction of a length is round-off.
 SLACK = 1e-9
 
+#: Pairs are looked for among so many things and all others at a time.
+ROWS = 256
+
 OPPOSITE = (("left", "right"), ("bottom", "top"), ("back", "front"))
 NO_Z = "bounds z, which dim = 2 does not have"
 
@@ -172,6 +175,35 @@ def images(period: np.ndarray, one: Reach, other: Reach) -> list[np.ndarray]:
     last = np.where(period > 0.0, np.floor((high_b - low) / length + SLACK), 0.0)
     ranges = [np.arange(a, b + 1.0) for a, b in zip(first, last, strict=True)]
     return [np.array(shift) * period for shift in itertools.product(*ranges)]
+
+
+def may_meet(lows: np.ndarray, highs: np.ndarray, period: np.ndarray) -> np.ndarray:
+    """Return which pairs of boxes meet, or whose images do: a superset by round-off, shape (n_pairs, 2).
+
+    Parameters
+    ----------
+    lows, highs : ndarray, shape (n, dim)
+        m.
+    period : ndarray, shape (dim,)
+        As ``periods`` returns it.
+    """
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    length = np.where(period > 0.0, period, 1.0)
+    slack = SLACK * (highs - lows).max(axis=1, initial=0.0)
+    for begin in range(0, len(lows), ROWS):
+        rows = slice(begin, begin + ROWS)
+        both = np.arange(len(lows))[rows, None] < np.arange(len(lows))
+        for axis in range(lows.shape[1]):
+            reach = slack[rows, None] + slack
+            before = lows[:, axis] - highs[rows, None, axis] - reach
+            beyond = highs[:, axis] - lows[rows, None, axis] + reach
+            if period[axis] > 0.0:
+                both &= np.ceil(before / length[axis]) <= np.floor(beyond / length[axis])
+            else:
+                both &= (before <= 0.0) & (beyond >= 0.0)
+        first, second = np.nonzero(both)
+        found.append(np.column_stack((first + begin, second)))
+    return np.concatenate(found)
 
 
 def overlap(a: Shape, b: Shape, dim: int, shift: np.ndarray) -> bool:

@@ -115,8 +115,13 @@ class Shape(Table):
     @classmethod
     def _absolute(cls, mesh: str | None, info: ValidationInfo) -> str | None:
         """Resolve a mesh path against the scene's directory, so that the run directory's copy still finds it."""
+        if mesh and "\0" in mesh:
+            raise PydanticCustomError("mesh", "must be the name of a file, without null characters")
         if mesh and info.context:
-            return os.path.abspath(Path(info.context["directory"], Path(mesh).expanduser()))
+            try:
+                return os.path.abspath(Path(info.context["directory"], Path(mesh).expanduser()))
+            except RuntimeError as error:  # ~somebody
+                raise PydanticCustomError("mesh", "must be the name of a file: there is no such user") from error
         return mesh
 
     @property
