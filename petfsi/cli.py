@@ -120,7 +120,7 @@ def run(
         _start_petsc(petsc, comm)
         from petfsi.run import run_scene
 
-        return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite)
+        return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets)
 
     ctx.exit(_together(work))
 

@@ -46,7 +46,9 @@ class Console:
             return
         if log_path is not None:
             with suppress(OSError):
-                self._log = os.open(log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+                self._log = os.open(
+                    log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666
+                )
         if sys.stdout.isatty() and not _is_launched():
             self._start_bar(total)
 

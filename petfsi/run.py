@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import signal
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
@@ -17,11 +17,15 @@ from mpi4py import MPI
 from petfsi import __version__, petsc, solve
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
+from petfsi.fields.base import Slab
 from petfsi.messages import shown
 from petfsi.options import Options
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
+from petfsi.output.lock import Lock, held, refuse_if_held
+from petfsi.output.manifest import Leg, Record
+from petfsi.output.mesh_files import mesh_files, own_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
@@ -34,6 +38,8 @@ from petfsi.scene.stepping import Stepping
 from petfsi.simulation import Simulation
 
 DONE, STOPPED = 0, 75
+#: Lines about what is wrong with a run directory.
+MAX_TOLD = 8
 Status = Literal["done", "stopped", "failed"]
 
 
@@ -74,9 +80,13 @@ class Stop:
 class Run:
     """A simulation with its run directory."""
 
-    def __init__(self, simulation: Simulation, files: RunDirectory, console: Console) -> None:
+    def __init__(
+        self, simulation: Simulation, files: RunDirectory, console: Console, known: Record, lock: Lock | None
+    ) -> None:
         self.simulation = simulation
         self.files = files
+        self.known = known
+        self.lock = lock
         self.console = console
         self.comm = simulation.comm
         self._begin = clock.perf_counter()
@@ -91,11 +101,10 @@ class Run:
         simulation.report = self.console.note
         others = [*self.effort(), *self.flaws(), *simulation.accounts.columns]
         columns = column_names(simulation.probe_columns(), others)
-        self.history = History(self.files.history, columns, self.comm)
+        self.history = History(self.files.history, columns, self.comm, self.known.history)
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
         if after is not None:
-            self.history.truncate(after)
-            self.writer.truncate(after)
+            self.writer.go_on(self.known, after, self.fields, self.console.warn)
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
@@ -158,6 +167,8 @@ class Run:
         """Write what is due after a step. Collective."""
         simulation = self.simulation
         scene = simulation.scene
+        if self.lock is not None:
+            self.lock.touch()
         self.iterations.append(simulation.outcome.iterations)
         self.volume_error = max(self.volume_error, simulation.volume_error)
         self.append_row()
@@ -201,14 +212,21 @@ class Run:
         now, dt = self.simulation.time, self.simulation.dt
         return int((now + 1e-6 * dt) / every) > int((now - dt + 1e-6 * dt) / every)
 
+    def fields(self) -> dict[str, dict[str, Slab]]:
+        """Return the fields of the present step. Collective."""
+        return {field.name: field.output() for field in self.simulation.fields}
+
     def write_fields(self) -> None:
         """Write the fields of the present step. Collective."""
-        simulation = self.simulation
-        self.writer.write(simulation.step, simulation.time, {field.name: field.output() for field in simulation.fields})
+        self.writer.write(self.simulation.step, self.simulation.time, self.fields())
 
     def checkpoint(self) -> None:
-        """Write a checkpoint, and let the solver forget what a resumed run could not know. Collective."""
+        """Write a checkpoint, and let the solver forget what a resumed run could not know. Collective.
+
+        What the checkpoint counts is on the disk before it.
+        """
         simulation = self.simulation
+        present = {"history": self.history.on_disk(), **self.writer.on_disk()}
         checkpoints.write_checkpoint(
             self.files.checkpoints,
             simulation.step,
@@ -218,6 +236,7 @@ class Run:
             {"version": __version__},
             self.comm,
             simulation.scene.checkpoint.keep,
+            self.known.model_copy(update=present),
         )
         simulation.forget()
 
@@ -278,6 +297,7 @@ def run_scene(
     petsc_args: list[str],
     wall_limit: float | None,
     overwrite: bool,
+    sets: Sequence[str] = (),
 ) -> int:
     """Run a scene into a new directory; return the exit status. Collective.
 
@@ -285,46 +305,88 @@ def run_scene(
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
+    on_root(comm, lambda: RunDirectory.check_place(out, overwrite))
+    on_root(comm, lambda: refuse_if_held(out))
+    meshes = on_root(comm, lambda: mesh_files(scene))
     simulation, unread, options = made_ready(comm, scene, petsc_args)
-    files = RunDirectory.create(out, dump_scene(scene), options.dump(), overwrite, comm)
-    with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
-        _greet(console, simulation, options, unread)
-        run = Run(simulation, files, console)
-        with run.recorded():
-            run.open()
-            run.append_row()
-            if scene.output.every:
-                run.write_fields()
-            return run.loop(steps, stop)
+    text = dump_scene(scene, own_names([mesh.mark for mesh in meshes], out))
+    with held(out, comm, make=True) as lock:
+        files = RunDirectory.create(out, text, options.dump(), overwrite, comm, meshes)
+        leg = _leg(simulation, sets, petsc_args)
+        known = on_root(comm, lambda: files.first_record(meshes, leg))
+        with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
+            _greet(console, simulation, options, unread)
+            run = Run(simulation, files, console, known, lock)
+            with run.recorded():
+                run.open()
+                run.append_row()
+                if scene.output.every:
+                    run.write_fields()
+                return run.loop(steps, stop)
 
 
 @np.errstate(all="ignore")
 def resume_run(
     directory: Path, steps: int | None, petsc_args: list[str], wall_limit: float | None, sets: list[str]
 ) -> int:
-    """Go on from a run's newest good checkpoint; return the exit status. Collective."""
+    """Go on from a run's newest good checkpoint; return the exit status. Collective.
+
+    Nothing is written before all fits: the scene, the options, the meshes and the rows that the checkpoint counts.
+    """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
     files = RunDirectory.open(directory, comm)
-    scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
-    options = solve.load_options(petsc_args, stored=files.options)
-    simulation = Simulation(comm, scene)
-    with Console(comm.rank, files.log, total=_total(scene, None)) as console:
-        found = checkpoints.find_checkpoint(files.checkpoints, comm, console.warn)
+    with held(directory, comm) as lock:
+        damaged: list[str] = []
+        found = checkpoints.find_checkpoint(files.checkpoints, comm, damaged.append)
         if found is None:
+            why = "".join(f"\n  {line}" for line in comm.bcast(damaged)[:MAX_TOLD])
             raise InputError(
-                f"{directory}: no checkpoint can be read; start again with 'petfsi run {files.scene} --out ...'"
+                f"{directory}: no checkpoint can be read; start again with 'petfsi run {files.scene} --out ...'{why}"
             )
+        known = found.manifest.run
+        if misfits := on_root(comm, lambda: files.misfits(known)):
+            lines = "".join(f"\n  {line}" for line in misfits[:MAX_TOLD])
+            raise InputError(f"{directory} does not fit its checkpoint {found.path.name}; nothing was changed:{lines}")
+        scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
+        options = solve.load_options(petsc_args, stored=files.options)
+        simulation = Simulation(comm, scene)
         # of the scene's start: it would move the fluid's faces to the restored solid
         unread = simulation.prepare(resumes=True)
-        with checkpoints.read_checkpoint(found, comm) as stored:
+        _restore(simulation, found)
+        with Console(comm.rank, files.log, total=_total(scene, None)) as console:
+            for line in damaged:
+                console.warn(line)
+            _greet(console, simulation, options, unread)
+            console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
+            run = Run(simulation, files, console, known, lock)
+            run.open(after=found.step)
+            text = dump_scene(scene, own_names(list(known.meshes), directory))
+            leg = _leg(simulation, sets, petsc_args)
+            run.known = on_root(comm, lambda: files.change(known, text, options.dump(), leg))
+            with run.recorded():
+                return run.loop(steps, stop)
+
+
+def _restore(simulation: Simulation, found: checkpoints.CheckpointInfo) -> None:
+    """Take up the state of a checkpoint. Collective; InputError on all ranks if it is not one of the scene's."""
+    with checkpoints.read_checkpoint(found, simulation.comm) as stored:
+        try:
             simulation.restore(stored.step, stored.time, stored.dt, stored.group)
-        _greet(console, simulation, options, unread)
-        console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
-        run = Run(simulation, files, console)
-        run.open(after=found.step)
-        with run.recorded():
-            return run.loop(steps, stop)
+        except (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError) as error:
+            what = " ".join(str(error).split())[:200]
+            raise InputError(f"checkpoint {found.path} holds no state of this scene: {what}") from error
+
+
+def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str]) -> Leg:
+    return Leg(
+        step=simulation.step,
+        time=simulation.time,
+        ranks=simulation.comm.size,
+        petfsi=__version__,
+        sets=tuple(sets),
+        options=tuple(options),
+    )
 
 
 def _total(scene: Scene, steps: int | None) -> int | None:

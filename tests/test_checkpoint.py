@@ -1,6 +1,5 @@
 """Checkpoints are whole or not there, and come back on any number of ranks. About 10 s."""
 
-import json
 import os
 import re
 import subprocess
@@ -13,6 +12,7 @@ from output_cases import cut, run_on, shared_directory, slabs, state
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output.checkpoint import find_checkpoint, read_checkpoint, write_checkpoint
+from petfsi.output.manifest import read_manifest
 
 comm = MPI.COMM_WORLD
 
@@ -100,8 +100,8 @@ def damage_file(path):
 
 
 def damage_format(path):
-    about = json.loads(path.with_suffix(".json").read_text())
-    path.with_suffix(".json").write_text(json.dumps(about | {"format": 99}))
+    sidecar = path.with_suffix(".json")
+    sidecar.write_text(read_manifest(sidecar.read_bytes()).model_copy(update={"format": 99}).text())
 
 
 DAMAGE = {
@@ -110,7 +110,7 @@ DAMAGE = {
     damage_sidecar: r"000010\.json is missing; writing it was interrupted",
     damage_sidecar_text: r"000010\.json is not readable",
     damage_file: r"000010\.h5 is missing",
-    damage_format: r"wrote it in another format",
+    damage_format: r"000010\.json is of format 99, by petfsi .*; this one reads format 4",
 }
 
 

@@ -1,7 +1,9 @@
 """What a run leaves on the disk besides checkpoints: directory, history, fields, summary, pictures. About 10 s."""
 
+import errno
 import itertools
 import json
+import os
 import re
 from xml.etree import ElementTree
 
@@ -16,6 +18,7 @@ from output_cases import centres, grid, grid_fields, output, run_on, shared_dire
 from petfsi.errors import InputError, SolveError
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names, read_history
+from petfsi.output.manifest import Record
 from petfsi.output.pictures import plot_run
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.slices import cut_tetrahedra
@@ -136,17 +139,22 @@ def test_output_does_not_depend_on_ranks_or_interruptions(tmp_path):
         write_fields(directory / "alone", 3, [0, 5, 10], on=MPI.COMM_SELF)
     comm.barrier()
     write_fields(directory / "through", 3, [0, 5, 10])
-    write_fields(directory / "resumed", 3, [0, 5, 7, 8])
+    writer = write_fields(directory / "resumed", 3, [0, 5])
+    known = Record(**writer.on_disk())
+    for step in (7, 8):
+        writer.write(step, 0.1 * step, output(3, 0.1 * step, comm))
     if comm.rank == 0:
         (directory / "resumed" / "fields" / "000009.h5.part").write_bytes(b"left by a kill")
-        (directory / "resumed" / "fields.xdmf").write_text("old")
     comm.barrier()
     writer = FieldWriter(directory / "resumed", comm, grid(3))
-    writer.truncate(6)
-    assert writer.times == [0.0, 0.5]
+    writer.go_on(known, 6, lambda: output(3, 0.6, comm), pytest.fail)
     assert len(series(directory / "resumed" / "fluid.xdmf")[2]) == 2
     writer.write(10, 1.0, output(3, 1.0, comm))
-    assert contents(directory / "through") == contents(directory / "alone") == contents(directory / "resumed")
+    through, alone, resumed = (contents(directory / name) for name in ("through", "alone", "resumed"))
+    listed = [files.pop("fields/outputs.csv").decode().splitlines() for files in (through, alone, resumed)]
+    assert through == alone == resumed
+    # the last column is when a file was written
+    assert len({tuple(line.rpartition(",")[0] for line in lines) for lines in listed}) == 1 and len(listed[0]) == 4
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -168,7 +176,7 @@ except PetfsiError as error:
     for rank, line in enumerate(lines):
         assert re.search(rf"^rank {rank} exit 3: step 5, t = 0.5 s: fields .*/000005.h5 could not be written:", line)
         assert line.endswith("File too large. There is no checkpoint.")
-    assert sorted(p.name for p in (tmp_path / "fields").iterdir()) == ["000000.h5", "mesh.h5"]
+    assert sorted(p.name for p in (tmp_path / "fields").iterdir()) == ["000000.h5", "mesh.h5", "outputs.csv"]
     assert len(series(tmp_path / "fluid.xdmf")[2]) == 1
 
 
@@ -199,16 +207,19 @@ def test_history_gives_every_number_back_exactly(tmp_path):
 @pytest.mark.parallel([1, 3])
 def test_history_goes_on_after_a_kill_as_if_nothing_had_happened(tmp_path):
     path = shared_directory(tmp_path, comm) / "history.csv"
-    History(path, COLUMNS, comm).append(row(1))
-    for step in (2, 3, 4):
-        History(path, COLUMNS, comm).append(row(step))
+    history = History(path, COLUMNS, comm)
+    for step in (1, 2):
+        history.append(row(step))
+    known = history.on_disk()
+    for step in (3, 4):
+        history.append(row(step))
     if comm.rank == 0:
         whole = path.read_bytes()
         path.write_bytes(whole + b"5,0.5,0.1,0.9")
         assert read_history(path)["step"].tolist() == [1, 2, 3, 4]
     comm.barrier()
-    history = History(path, COLUMNS, comm)
-    history.truncate(2)
+    history = History(path, COLUMNS, comm, known)
+    assert read_history(path)["step"].tolist() == [1, 2] and history.on_disk() == known
     for step in (3, 4):
         history.append(row(step))
     comm.barrier()
@@ -221,30 +232,47 @@ def test_history_refuses_what_is_not_its_own(tmp_path):
     history = History(path, COLUMNS, comm)
     with pytest.raises(ValueError, match="a row of"):
         history.append({"step": 1})
-    history.append(row(1))
+    for step in (1, 2):
+        history.append(row(step))
+    known = history.on_disk()
     with pytest.raises(
         InputError, match=r"history\.csv has the columns step, time, dt, top\.x, .*, not step, time, dt,"
     ):
-        History(path, column_names(["other"]), comm)
-    if comm.rank == 0:
-        path.write_text(path.read_text() + "2,0.2,oops\n")
-    comm.barrier()
-    with pytest.raises(InputError, match=r"history\.csv, line 3: not a row of 8 numbers"):
-        History(path, COLUMNS, comm)
+        History(path, column_names(["other"]), comm, known)
+    whole = contents(path.parent)["history.csv"]
+    lines = whole.splitlines(keepends=True)
+    edits = {
+        r"line 3: not a row of 8 numbers": [*lines[:2], b"2,0.2,oops\n"],
+        r"its content has been changed": [*lines[:2], lines[2].replace(b"0.2", b"0.3")],
+        r"it has 1 rows and should have 2 or more": lines[:2],
+        r"it has 0 rows and should have 2 or more": [],
+    }
+    for said, edited in edits.items():
+        if comm.rank == 0:
+            path.write_bytes(b"".join(edited))
+        with pytest.raises(InputError, match=rf"history\.csv.*{said}"):
+            History(path, COLUMNS, comm, known)
+        assert contents(path.parent)["history.csv"] == b"".join(edited)
     with pytest.raises(InputError, match=r"nothing\.csv cannot be read: No such file"):
         read_history(path.with_name("nothing.csv"))
 
 
 @pytest.mark.parallel([1, 3])
-def test_history_on_a_full_disk_is_a_solve_error_on_all_ranks(tmp_path):
+def test_history_on_a_full_disk_is_a_solve_error_on_all_ranks(tmp_path, monkeypatch):
     path = shared_directory(tmp_path, comm) / "history.csv"
     history = History(path, COLUMNS, comm)
+    before = contents(path.parent)
+
+    def full(handle, data, at, write=os.pwrite):
+        if len(data) > 10:
+            return write(handle, data[:-10], at)
+        raise OSError(errno.ENOSPC, "no room")
+
     if comm.rank == 0:
-        path.unlink()
-        path.symlink_to("/dev/full")
-    comm.barrier()
+        monkeypatch.setattr(os, "pwrite", full)
     with pytest.raises(SolveError, match=r"history\.csv could not be written: No space left on device .* be resumed"):
         history.append(row(1))
+    assert contents(path.parent) == before
 
 
 # ---- summary ------------------------------------------------------------------------------------------------

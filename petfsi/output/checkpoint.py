@@ -1,14 +1,15 @@
 """Checkpoints: all that the next step reads, whole and checked, the last few of them.
 
-A checkpoint is two files, ``NNNNNN.h5`` with the data and ``NNNNNN.json`` with the data's checksum. The second is
-moved into place last: without it, or when it does not match, there is no checkpoint.
+A checkpoint is two files, ``NNNNNN.h5`` with the data and ``NNNNNN.json``, its manifest, with the data's checksum and
+what the run held at that moment. The second is moved into place last: without it, or when it does not match, there is
+no checkpoint.
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -23,25 +24,35 @@ from mpi4py import MPI
 import petfsi
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Reader, Slab
-from petfsi.output import files, hdf5
+from petfsi.output import files, hdf5, stored_state
+from petfsi.output.manifest import FORMAT, MAX_BYTES, Manifest, Mark, Record, read_manifest
 from petfsi.ranks import on_root
 
-#: Of the layout of a checkpoint; raised when an older petfsi could not read it.
-FORMAT = 3
-_CHUNK = 1 << 24
+#: So many entries that a file does not hold are made up, until all ranks have read what they want.
+_BEYOND = 1 << 26
 
 
 @dataclass(frozen=True)
 class CheckpointInfo:
-    """What the small file beside a checkpoint says."""
+    """A checkpoint's file and its manifest."""
 
     path: Path
-    checksum: str
-    bytes: int
-    step: int
-    time: float
-    ranks: int
-    version: str
+    manifest: Manifest
+
+    @property
+    def step(self) -> int:
+        """The step that was finished last."""
+        return self.manifest.step
+
+    @property
+    def time(self) -> float:
+        """The time reached, s."""
+        return self.manifest.time
+
+    @property
+    def ranks(self) -> int:
+        """How many processes wrote it."""
+        return self.manifest.ranks
 
 
 def write_checkpoint(
@@ -53,6 +64,7 @@ def write_checkpoint(
     attributes: Mapping[str, Any],
     comm: MPI.Comm,
     keep: int,
+    run: Record | None = None,
 ) -> Path:
     """Write a checkpoint, remove the oldest ones beyond ``keep``, and return its file. Collective.
 
@@ -70,6 +82,8 @@ def write_checkpoint(
         The ranks that hold pieces.
     keep : int
         How many stay, this one included; at least 1.
+    run : Record, optional
+        What the checkpoint vouches for; all of that is on the disk already. Rank 0's counts.
 
     Raises
     ------
@@ -82,7 +96,7 @@ def write_checkpoint(
     try:
         on_root(comm, lambda: _prepare(path.parent))
         hdf5.write_file(files.part_of(path), arrays, about, comm)
-        on_root(comm, lambda: _commit(path, step, time, comm.size))
+        on_root(comm, lambda: _commit(path, step, time, dt, comm.size, run or Record()))
     except OSError as error:
         on_root(comm, lambda: _discard(path))
         last = last_good(path.parent, comm)
@@ -95,29 +109,43 @@ def write_checkpoint(
 
 
 def _prepare(directory: Path) -> None:
-    directory.mkdir(parents=True, exist_ok=True)
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    files.own_directory(directory)
     for left in directory.glob("*.part"):
-        left.unlink()
+        if left.name.partition(".")[0].isdecimal():
+            left.unlink()
 
 
-def _commit(path: Path, step: int, time: float, ranks: int) -> None:
+def _commit(path: Path, step: int, time: float, dt: float, ranks: int, run: Record) -> None:
     """Turn the written part into a checkpoint."""
     part, sidecar = files.part_of(path), path.with_suffix(".json")
-    about = {
-        "file": path.name,
-        "checksum": checksum(part),
-        "bytes": part.stat().st_size,
-        "step": step,
-        "time": time,
-        "ranks": ranks,
-        "version": petfsi.__version__,
-        "format": FORMAT,
-    }
+    size, checksum = files.digest(part)
+    manifest = Manifest(
+        format=FORMAT,
+        petfsi=petfsi.__version__,
+        file=path.name,
+        step=step,
+        time=float(time),
+        dt=float(dt),
+        ranks=ranks,
+        data=Mark(bytes=size, blake2b=checksum),
+        run=run,
+    )
     # the text is on the disk before either file gets its name: from here on nothing needs space
-    text = files.write_part(sidecar, json.dumps(about, indent=1) + "\n")
+    text = files.write_part(sidecar, manifest.text())
     os.replace(part, path)
     os.replace(text, sidecar)
     files.sync_directory(path.parent)
+
+
+def change_records(directory: Path, change: Callable[[Record], Record]) -> None:
+    """Change what the checkpoints that are there vouch for, each in one piece. Rank 0 alone."""
+    for number in _numbers(directory):
+        found = _inspect(directory, number, thorough=False)
+        if isinstance(found, CheckpointInfo):
+            manifest = found.manifest
+            changed = manifest.model_copy(update={"run": change(manifest.run)})
+            files.replace_text(found.path.with_suffix(".json"), changed.text())
 
 
 def _discard(path: Path) -> None:
@@ -146,19 +174,10 @@ def _prune(directory: Path, step: int, keep: int) -> None:
                 (directory / f"{number:06d}.h5").unlink(missing_ok=True)
 
 
-def checksum(path: Path) -> str:
-    """Return the BLAKE2b digest of a file, 32 bytes in hexadecimal."""
-    digest = hashlib.blake2b(digest_size=32)
-    with open(path, "rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
-
-
 def _numbers(directory: Path) -> list[int]:
     """Return the steps of which there is either file, ascending."""
     found = {p.stem for pattern in ("*.h5", "*.json") for p in directory.glob(pattern)}
-    return sorted(int(stem) for stem in found if stem.isdecimal())
+    return sorted(int(stem) for stem in found if stem.isascii() and stem.isdecimal() and f"{int(stem):06d}" == stem)
 
 
 def _inspect(directory: Path, number: int, thorough: bool = True) -> CheckpointInfo | str:
@@ -166,26 +185,24 @@ def _inspect(directory: Path, number: int, thorough: bool = True) -> CheckpointI
     path = directory / f"{number:06d}.h5"
     sidecar = path.with_suffix(".json")
     try:
-        if not sidecar.exists():
+        if not os.path.lexists(sidecar):
             return f"{sidecar.name} is missing; writing it was interrupted"
-        about = json.loads(sidecar.read_text(encoding="utf-8"))
-        if about.pop("format") != FORMAT:
-            return f"petfsi {about['version']} wrote it in another format"
-        if about.pop("file") != path.name:
+        found = read_manifest(files.read_plain(sidecar, MAX_BYTES))
+        if isinstance(found, str):
+            return f"{sidecar.name} {found}"
+        if (found.file, found.step) != (path.name, number):
             return f"{sidecar.name} speaks of another file"
-        info = CheckpointInfo(path=path, **about)
-        size = path.stat().st_size
-        if size != info.bytes:
-            return f"it has {size} bytes and should have {info.bytes}"
-        if thorough and checksum(path) != info.checksum:
+        size = os.lstat(path).st_size
+        if size != found.data.bytes:
+            return f"it has {size} bytes and should have {found.data.bytes}"
+        if thorough and files.digest(path)[1] != found.data.blake2b:
             return "its checksum does not match"
+        wrong = stored_state.fault(path, found) if thorough else ""
     except FileNotFoundError:
         return f"{path.name} is missing"
     except OSError as error:
-        return os.strerror(error.errno or errno.EIO)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return f"{sidecar.name} is not readable"
-    return info
+        return files.reason(error)
+    return wrong or CheckpointInfo(path, found)
 
 
 def find_checkpoint(directory: Path, comm: MPI.Comm, report: Callable[[str], None]) -> CheckpointInfo | None:
@@ -280,6 +297,8 @@ class CheckpointReader:
         end = tuple(s + c for s, c in zip(start, count, strict=True))
         inside = all(e <= n for e, n in zip(end, dataset.shape, strict=True))
         self._ends[name] = tuple(map(max, end, self._ends.get(name, end)))
+        if not inside and math.prod(count) > dataset.size + _BEYOND:  # a number in the file asked for it
+            raise InputError(f"checkpoint {self.path}: '{name}' has shape {dataset.shape}; the scene wants {end}")
         data = np.zeros(count, dataset.dtype)
         if inside and data.size:
             try:

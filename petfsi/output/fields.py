@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.errors import InputError, SolveError
+from petfsi.errors import SolveError
 from petfsi.fields.base import Slab
 from petfsi.output import checkpoint, files, hdf5, xdmf
+from petfsi.output.growing import Changed, GrowingXml
+from petfsi.output.manifest import Index, Mark, Record, Rows
+from petfsi.output.outputs import Outputs, Written
 from petfsi.output.xdmf import Arrays, Entry, GridInfo
 from petfsi.ranks import on_root
 
 #: Arrays of the solid that never change and are stored once.
 STATIC = ("points", "cells", "body")
+#: The file of what never changes, relative to the run.
+MESH = "fields/mesh.h5"
+#: So many damaged files are told of one by one.
+MAX_TOLD = 5
+
+Groups = Mapping[str, Mapping[str, Slab]]
 
 
 class FieldWriter:
     """Writes ``fields/NNNNNN.h5``, ``fields/mesh.h5`` and the XDMF files of a run. All methods are collective.
-
-    An existing run is continued; call ``truncate`` first to drop what came after the step it resumes from.
 
     Parameters
     ----------
@@ -42,15 +52,11 @@ class FieldWriter:
         self.grid = grid
         self._mesh = self.directory / "fields" / "mesh.h5"
         self._static: Arrays | None = None  # until there is a mesh.h5, which has no arrays where nothing is fixed
-        self._entries: list[Entry] = []
-        self._static, self._entries = on_root(comm, self._find)
+        self._mesh_mark: Mark | None = None
+        self._outputs = Outputs(self.directory / "fields")
+        self._indexes = Indexes(self.directory)
 
-    @property
-    def times(self) -> list[float]:
-        """The output times so far, s."""
-        return [entry.time for entry in self._entries]
-
-    def write(self, step: int, time: float, groups: Mapping[str, Mapping[str, Slab]]) -> Path:
+    def write(self, step: int, time: float, groups: Groups) -> Path:
         """Write the fields of one time and return their file.
 
         Parameters
@@ -70,23 +76,29 @@ class FieldWriter:
         """
         path = self.directory / "fields" / f"{step:06d}.h5"
         arrays, views = self._arrays(groups)
-        about = {"step": step, "time": time}
         needed = hdf5.n_bytes(arrays)
+        part = files.part_of(path)
         try:
-            on_root(self.comm, lambda: path.parent.mkdir(exist_ok=True))
+            on_root(self.comm, lambda: files.own_directory(path.parent))
             if self._static is None:
                 self._write_mesh(groups.get("solid", {}))
-            part = files.part_of(path)
-            hdf5.write_file(part, arrays, about, self.comm, views)
+            hdf5.write_file(part, arrays, {"step": step, "time": time}, self.comm, views)
             entry = Entry(step, time, f"fields/{path.name}", _described(arrays, views))
-            self._entries = sorted([*(e for e in self._entries if e.step != step), entry], key=lambda e: e.step)
-            on_root(self.comm, lambda: files.publish(part, path))
-            on_root(self.comm, self._index)
+            on_root(self.comm, lambda: self._publish(part, path, entry))
         except OSError as error:
+            on_root(self.comm, lambda: _discard(part))
             self._fail(f"step {step}, t = {time:g} s: fields {path} could not be written", error, needed)
         return path
 
-    def _arrays(self, groups: Mapping[str, Mapping[str, Slab]]) -> tuple[dict[str, Slab], dict[str, hdf5.View]]:
+    def _publish(self, part: Path, path: Path, entry: Entry) -> None:
+        """Give a file its name, once the list has it; what had the name already is not the run's, and steps aside."""
+        self._outputs.append(Written.of(part, path.name, entry.step, entry.time))
+        if os.path.lexists(path):
+            os.replace(path, _aside(path))
+        files.publish(part, path)
+        self._indexes.append(xdmf.parts(MESH, self._static or {}, entry, self.grid))
+
+    def _arrays(self, groups: Groups) -> tuple[dict[str, Slab], dict[str, hdf5.View]]:
         """Return what the file of one time holds, and the second names in it for readers that want a list of cells."""
         fluid, solid, particles = (groups.get(name, {}) for name in ("pressure", "solid", "particles"))
         arrays = {f"fluid/{name}": _z_first(slab, len(self.grid.cells)) for name, slab in fluid.items() if self.grid}
@@ -98,14 +110,6 @@ class FieldWriter:
         if particles:
             arrays["particles/vertices"] = _vertices(particles["points"])
         return arrays, views
-
-    def truncate(self, step: int) -> None:
-        """Drop the output after a step, and what an interrupted write left."""
-        self._entries = [entry for entry in self._entries if entry.step <= step]
-        try:
-            on_root(self.comm, self._remove_others)
-        except OSError as error:
-            self._fail(f"{self.directory}: output after step {step} could not be removed", error, 0)
 
     def _fail(self, what: str, error: OSError, needed: int) -> None:
         last = checkpoint.last_good(self.directory / "checkpoint", self.comm)
@@ -123,42 +127,182 @@ class FieldWriter:
         about = {} if self.grid is None else {k: list(getattr(self.grid, k)) for k in ("origin", "spacing", "cells")}
         part = files.part_of(self._mesh)
         hdf5.write_file(part, arrays, about, self.comm)
-        on_root(self.comm, lambda: files.publish(part, self._mesh))
+
+        def publish() -> Mark:
+            size, found = files.digest(part)
+            files.publish(part, self._mesh)
+            return Mark(bytes=size, blake2b=found)
+
+        self._mesh_mark = on_root(self.comm, publish)
         self._static = _described(arrays, {})
 
-    def _index(self) -> None:
-        mesh = self._mesh.relative_to(self.directory).as_posix()
-        texts = xdmf.indexes(mesh, self._static or {}, self._entries, self.grid)
-        for name, text in texts.items():
-            files.replace_text(self.directory / name, text)
-        if xdmf.CLOUDS not in texts:  # of output that has been dropped
-            (self.directory / xdmf.CLOUDS).unlink(missing_ok=True)
+    # ---- what a manifest says, and going on ---------------------------------------------------------------------
 
-    def _find(self) -> tuple[Arrays | None, list[Entry]]:
-        """Return the mesh's arrays and the entries of the files that are there."""
-        if not self._mesh.exists():
-            return None, []
+    def on_disk(self) -> dict[str, Any]:
+        """Return what a ``Record`` says of output, once that is on the disk; meant for rank 0."""
         try:
-            entries = []
+            return on_root(
+                self.comm,
+                lambda: {
+                    "outputs": self._outputs.on_disk(),
+                    "mesh": self._mesh_mark,
+                    "indexes": self._indexes.on_disk(),
+                },
+            )
+        except OSError as error:
+            self._fail(f"output in {self.directory} could not be written", error, 0)
+            raise
+
+    def go_on(self, known: Record, step: int, groups: Callable[[], Groups], report: Callable[[str], None]) -> None:
+        """Go on from a checkpoint: drop the output after it, look at the rest, and mend what can be made again.
+
+        Parameters
+        ----------
+        known : Record
+            Of the checkpoint.
+        step : int
+            The checkpoint's.
+        groups : callable
+            Returns the present fields as ``write`` takes them; for a lost ``mesh.h5``. Collective.
+        report : callable
+            Is told, on rank 0 alone, what is damaged or missing; nothing else is lost by that.
+        """
+        try:
+            said, whole = on_root(self.comm, lambda: self._look(known, step))
+            # all ranks must know alike whether there is a mesh.h5: they write it together
+            self._static, self._mesh_mark = self.comm.bcast((self._static, self._mesh_mark))
+            if not whole:
+                self._write_mesh(groups().get("solid", {}))
+            said += on_root(self.comm, lambda: self._take_up_indexes(known, bool(said)))
+        except OSError as error:
+            self._fail(f"{self.directory}: output after step {step} could not be removed", error, 0)
+        if self.comm.rank == 0:
+            for line in said:
+                report(line)
+
+    def _look(self, known: Record, step: int) -> tuple[list[str], bool]:
+        """Take up the list of files; return what is to be told and whether ``mesh.h5`` is whole. Rank 0 alone."""
+        directory = self._mesh.parent
+        if known.outputs is None and not directory.exists():
+            return [], True
+        files.own_directory(directory)
+        said = self._take_up_list(known.outputs, step)
+        _sweep(directory)
+        damaged = self._outputs.damaged()
+        said += [f"{directory / name} {how}" for name, how in list(damaged.items())[:MAX_TOLD]]
+        if len(damaged) > MAX_TOLD:
+            said.append(f"and so are {len(damaged) - MAX_TOLD} more of {len(self._outputs.rows)} output files")
+        ours = {row.file for row in self._outputs.rows}
+        others = [path.name for path in field_files(self.directory) if path.name not in ours]
+        if others:
+            count = f" and {len(others) - 1} more" if len(others) > 1 else ""
+            said.append(f"{directory / others[0]}{count}: not in the list of this run's output; left alone")
+        if known.mesh is None:
+            return said, True
+        try:
+            size, found = files.digest(self._mesh)
+            whole = (size, found) == (known.mesh.bytes, known.mesh.blake2b)
+            if whole:
+                with h5py.File(self._mesh, "r") as file:
+                    self._static, self._mesh_mark = _stored(file), known.mesh
+        except OSError:
+            whole = False
+        return said + ([] if whole else [f"{self._mesh} is missing or has been changed; it is written anew"]), whole
+
+    def _take_up_list(self, known: Rows | None, step: int) -> list[str]:
+        try:
+            self._outputs.go_on(known, step)
+            return []
+        except Changed as error:
+            rows = []
             for path in field_files(self.directory):
-                with h5py.File(path, "r") as file:
-                    step, time = int(file.attrs["step"]), float(file.attrs["time"])
-                    entries.append(Entry(step, time, f"fields/{path.name}", _stored(file)))
-            with h5py.File(self._mesh, "r") as file:
-                return _stored(file), sorted(entries, key=lambda entry: entry.step)
-        except (OSError, KeyError) as error:
-            raise InputError(f"output in {self._mesh.parent} cannot be read: {error}") from error
+                entry = _entry(path)
+                if entry is not None and entry.step <= step and path.stem == f"{entry.step:06d}":
+                    rows.append(Written.of(path, path.name, entry.step, entry.time))
+            self._outputs.begin_anew(rows)
+            return [f"{self._outputs.path}: {error}; it is written anew of the {len(rows)} files found"]
+
+    def _take_up_indexes(self, known: Record, damaged: bool) -> list[str]:
+        """Take up the indexes, or write them anew of the files that can be read. Rank 0 alone."""
+        said = [] if damaged else self._indexes.go_on(known.indexes)
+        if damaged or said:
+            found = [_entry(self._mesh.parent / row.file) for row in self._outputs.rows]
+            entries = [entry for entry in found if entry is not None]
+            self._indexes.begin_anew(xdmf.parts(MESH, self._static or {}, entry, self.grid) for entry in entries)
+        return said
+
+
+class Indexes:
+    """The XDMF files of a run. Rank 0 alone."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._files: dict[Index, GrowingXml] = {}
+
+    def append(self, parts: Mapping[Index, str]) -> None:
+        """Add what an output time says, by index."""
+        for name, text in parts.items():
+            if name not in self._files:
+                self._files[name] = GrowingXml(self.directory / name, xdmf.BEGIN, xdmf.END)
+            self._files[name].append(text)
+
+    def on_disk(self) -> dict[Index, Mark]:
+        """Return what is final of them, once it is on the disk."""
+        return {name: file.on_disk() for name, file in self._files.items()}
+
+    def go_on(self, known: Mapping[Index, Mark]) -> list[str]:
+        """Take up the indexes and drop what is behind that; return which are not what they were."""
+        said = []
+        for name, mark in known.items():
+            file = GrowingXml(self.directory / name, xdmf.BEGIN, xdmf.END)
+            try:
+                file.go_on(mark)
+                self._files[name] = file
+            except Changed as error:
+                said.append(f"{file.path}: {error}; it is written anew")
+        self._remove_others()
+        return said
+
+    def begin_anew(self, all_parts: Iterable[Mapping[Index, str]]) -> None:
+        """Write them anew."""
+        self._files = {}
+        for parts in all_parts:
+            self.append(parts)
+        self._remove_others()
 
     def _remove_others(self) -> None:
-        kept = {self.directory / entry.file for entry in self._entries}
-        if self._static is not None:
-            self._index()  # before the files go, so that the index never names one that is gone
-        for path in field_files(self.directory):
-            if path not in kept:
-                path.unlink()
-        for part in (self.directory / "fields").glob("*.part"):
-            with suppress(FileNotFoundError):
-                part.unlink()
+        """Remove the indexes of output that has been dropped."""
+        for name in xdmf.NAMES:
+            if name not in self._files:
+                (self.directory / name).unlink(missing_ok=True)
+
+
+def _entry(path: Path) -> Entry | None:
+    """Return what an output file holds; None of one that cannot be read."""
+    try:
+        os.close(files.open_plain(path))
+        with h5py.File(path, "r") as file:
+            return Entry(int(file.attrs["step"]), float(file.attrs["time"]), f"fields/{path.name}", _stored(file))
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError):
+        return None
+
+
+def _sweep(directory: Path) -> None:
+    """Remove what an interrupted write left."""
+    for part in directory.glob("*.h5.part"):
+        if part.name == "mesh.h5.part" or part.name.removesuffix(".h5.part").isdecimal():
+            part.unlink(missing_ok=True)
+
+
+def _discard(part: Path) -> None:
+    with suppress(OSError):
+        part.unlink(missing_ok=True)
+
+
+def _aside(path: Path) -> Path:
+    """Return a free name beside a file."""
+    names = (path.with_name(f"{path.name}.aside{n or ''}") for n in count())
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def field_files(directory: Path) -> list[Path]:

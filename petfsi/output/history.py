@@ -8,12 +8,15 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output import files
+from petfsi.output.growing import Changed, Table
+from petfsi.output.manifest import Rows
 from petfsi.ranks import on_root
 
 #: The columns that hold whole numbers.
@@ -28,25 +31,29 @@ def column_names(probes: Sequence[str], others: Sequence[str] = ()) -> list[str]
 class History:
     """The growing table of a run. All methods are collective; only rank 0 touches the file.
 
-    An existing file is continued, after the end of its last whole row.
+    Parameters
+    ----------
+    path : Path
+    columns : sequence of str
+    comm : MPI.Comm
+    known : Rows, optional
+        Of a run that goes on: the rows that its checkpoint counts. Those behind them are dropped. Without it the table
+        is new.
 
     Raises
     ------
     InputError
-        When an existing file has other columns, or is damaged before its last row.
+        When the known rows are not what they were, or have other columns.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str], comm: MPI.Comm) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], comm: MPI.Comm, known: Rows | None = None) -> None:
         self.path = Path(path)
         self.columns = list(columns)
         self.comm = comm
         if comm.rank == 0 and len(set(columns)) != len(self.columns):
             raise ValueError(f"a column stands twice in {columns}")
-        self.truncate(None)
-
-    def truncate(self, step: int | None) -> None:
-        """Drop the rows after ``step``, or none but a torn last one. Collective."""
-        self._on_root(lambda: self._rewrite(step))
+        self._table: Table | None = None
+        self._on_root(lambda: self._open(known))
 
     def append(self, row: Mapping[str, float]) -> None:
         """Write a row and hand it to the system, so that it outlives the process. Collective.
@@ -58,9 +65,19 @@ class History:
         """
         self._on_root(lambda: self._write(row))
 
-    def _on_root(self, work: Callable[[], None]) -> None:
+    def on_disk(self) -> Rows:
+        """Return how many rows there are, once they are on the disk. Collective.
+
+        Raises
+        ------
+        SolveError
+            On all ranks, when the disk does not take them.
+        """
+        return self._on_root(lambda: self._table.on_disk() if self._table else None)
+
+    def _on_root(self, work: Callable[[], Any]) -> Any:
         try:
-            on_root(self.comm, work)
+            return on_root(self.comm, work)
         except OSError as error:
             last = ""
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -68,39 +85,47 @@ class History:
             why = files.agreed_reason(self.comm, error)
             raise SolveError(f"{self.path} could not be written: {why}.{last}") from error
 
-    def _rewrite(self, step: int | None) -> None:
-        rows: list[list[str]] = []
-        if self.path.exists() and self.path.stat().st_size:
-            header, rows = _rows(self.path)
-            if header is not None and header != self.columns:
-                raise InputError(f"{self.path} has the columns {', '.join(header)}, not {', '.join(self.columns)}")
-        kept = [row for row in rows if step is None or int(row[0]) <= step]
-        files.replace_text(self.path, "".join(",".join(row) + "\n" for row in [self.columns, *kept]))
+    def _open(self, known: Rows | None) -> None:
+        header = ",".join(self.columns)
+        if known is None:
+            self._table = Table.begun(self.path, header)
+            return
+        self._table, _behind = known_rows(self.path, known)
+        with open(files.open_plain(self.path), encoding="utf-8", errors="replace") as file:
+            found = file.readline().rstrip("\n")
+        if found != header:
+            raise InputError(f"{self.path} has the columns {found.replace(',', ', ')}, not {', '.join(self.columns)}")
+        self._table.cut()
 
     def _write(self, row: Mapping[str, float]) -> None:
         if row.keys() != set(self.columns):
             raise ValueError(f"a row of {self.path} has {sorted(row)} and should have {sorted(self.columns)}")
-        text = ",".join(str(int(row[c])) if c in WHOLE else repr(float(row[c])) for c in self.columns)
-        handle = os.open(self.path, os.O_WRONLY | os.O_APPEND)
-        size = os.fstat(handle).st_size
-        left = (text + "\n").encode()
-        try:
-            # in one call to the system, so that a kill tears at most the last row; a disk with room for a part of
-            # it takes that and refuses the rest
-            while left:
-                left = left[os.write(handle, left) :]
-        except OSError as error:
-            with suppress(OSError):
-                os.ftruncate(handle, size)
-            error.filename = str(self.path)
-            raise
-        finally:
-            os.close(handle)
+        assert self._table is not None
+        self._table.append(",".join(str(int(row[c])) if c in WHOLE else repr(float(row[c])) for c in self.columns))
+
+
+def known_rows(path: Path, known: Rows) -> tuple[Table, bytes]:
+    """Return a history whose first rows are those that a checkpoint counts, and what is behind them. Not collective.
+
+    Raises
+    ------
+    InputError
+        When they are not: how, and what can be done.
+    """
+    try:
+        return Table.known(path, known)
+    except Changed as error:
+        how = str(error)
+    with suppress(OSError):
+        found = len(_rows(path)[1])
+        if found < known.rows:
+            how = f"it has {found} rows and should have {known.rows} or more"
+    raise InputError(f"{path} is not the one whose {known.rows} rows the checkpoint counts: {how}; put it back")
 
 
 def _rows(path: Path) -> tuple[list[str] | None, list[list[str]]]:
     """Return header and whole rows as text; a last row without its line end is left out."""
-    with open(path, encoding="utf-8", errors="replace", newline="") as file:
+    with open(files.open_plain(path), encoding="utf-8", errors="replace", newline="") as file:
         lines = file.read().split("\n")[:-1]
     if not lines:
         return None, []

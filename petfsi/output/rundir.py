@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +15,23 @@ from mpi4py import MPI
 import petfsi
 from petfsi.errors import InputError
 from petfsi.output import files
+from petfsi.output.checkpoint import change_records
+from petfsi.output.history import known_rows
+from petfsi.output.lock import NAME as LOCK
+from petfsi.output.manifest import FORMAT, Leg, Record
+from petfsi.output.mesh_files import DIRECTORY, MeshFile, changed_meshes, copy_meshes
 from petfsi.ranks import on_root
 
 #: Marks a directory as a run: a scene and options alone may be somebody's own.
 MARKER = ".petfsi-run"
 #: Set aside while a run is under way, so that a full disk still takes its last words (bytes).
 RESERVE, RESERVE_BYTES = ".reserve", 16384
+#: Where a new run's meshes are while an old one is removed.
+STAGED = "meshes.part"
 _FILES = ".reserve scene.toml options.opts history.csv summary.json log.txt".split()
 _FILES += "fields.xdmf solid.xdmf fluid.xdmf particles.xdmf".split()
 _DIRECTORIES = {
-    "fields": re.compile(r"(\d{6,}|mesh)\.h5(\.part)?"),
+    "fields": re.compile(r"(\d{6,}|mesh)\.h5(\.part)?|outputs\.csv(\.part)?"),
     "checkpoint": re.compile(r"\d{6,}\.(h5|json)(\.part)?"),
     "pictures": re.compile(r"(\d{6,}|history)\.png|film\.gif(\.part)?"),
 }
@@ -66,8 +74,16 @@ class RunDirectory:
         return self.path / "checkpoint"
 
     @classmethod
-    def create(cls, path: Path, scene_text: str, options_text: str, overwrite: bool, comm: MPI.Comm) -> RunDirectory:
-        """Make the directory of a new run. Collective.
+    def create(
+        cls,
+        path: Path,
+        scene_text: str,
+        options_text: str,
+        overwrite: bool,
+        comm: MPI.Comm,
+        meshes: Sequence[MeshFile] = (),
+    ) -> RunDirectory:
+        """Make the directory of a new run; its lock is held. Collective.
 
         With ``overwrite`` an earlier run in it is removed: the files that petfsi wrote, nothing else.
 
@@ -79,7 +95,7 @@ class RunDirectory:
         """
         run = cls(Path(path))
         try:
-            on_root(comm, lambda: run._create(scene_text, options_text, overwrite))
+            on_root(comm, lambda: run._create(scene_text, options_text, overwrite, list(meshes)))
         except OSError as error:
             where = error.filename or path
             why = files.agreed_reason(comm, error)
@@ -88,62 +104,178 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: Path, comm: MPI.Comm) -> RunDirectory:
-        """Return an existing run. Collective; InputError on all ranks if it is none."""
+        """Return an existing run. Collective; InputError on all ranks if it is none, or one that cannot go on."""
         run = cls(Path(path))
-        if not on_root(comm, run._is_run):
-            raise InputError(f"{path} is not the directory of a run: it has no {MARKER}")
+        on_root(comm, run._check_run)
         return run
+
+    @classmethod
+    def check_place(cls, path: Path, overwrite: bool) -> None:
+        """Raise InputError unless a run can be made here. Not collective; writes nothing."""
+        cls(Path(path))._check_place(overwrite)
 
     def keep_reserve(self) -> None:
         """Set a little room aside, where there is some. Rank 0 alone."""
-        with suppress(OSError):
-            (self.path / RESERVE).write_bytes(bytes(RESERVE_BYTES))
+        with suppress(OSError), open(files.new_file(self.path / RESERVE), "wb") as file:
+            file.write(bytes(RESERVE_BYTES))
 
     def free_reserve(self) -> None:
         """Give that room back. Rank 0 alone."""
         with suppress(OSError):
             (self.path / RESERVE).unlink(missing_ok=True)
 
+    def first_record(self, meshes: Sequence[MeshFile], leg: Leg) -> Record:
+        """Return what the first checkpoint says of a run that has just been made. Not collective."""
+        scene, options = (files.digest(path)[1] for path in (self.scene, self.options))
+        marks = tuple(mesh.mark for mesh in meshes)
+        return Record(scene=(scene,), options=(options,), meshes=marks, legs=(leg,))
+
+    def misfits(self, known: Record) -> list[str]:
+        """Return what of the run is not what a checkpoint of it vouches for, and what can be done. Not collective."""
+        remedy = {
+            self.scene: "put it back; 'petfsi resume --set' changes what may change",
+            self.options: "put it back; other PETSc options may stand behind 'petfsi resume DIR'",
+        }
+        wrong = []
+        for path, digests in ((self.scene, known.scene), (self.options, known.options)):
+            try:
+                if files.digest(path)[1] not in digests:
+                    wrong.append(f"{path} has been changed since the checkpoint was written: {remedy[path]}")
+            except FileNotFoundError:
+                wrong.append(f"{path} is missing: put it back")
+            except OSError as error:
+                wrong.append(f"{path}: {files.reason(error)}")
+        wrong += changed_meshes(known.meshes, self.path)
+        if known.history is None:
+            return [*wrong, f"{self.history}: the checkpoint counts no rows of it"]
+        try:
+            known_rows(self.history, known.history)
+        except InputError as error:
+            wrong.append(str(error))
+        return wrong
+
+    def change(self, known: Record, scene_text: str, options_text: str, leg: Leg) -> Record:
+        """Give a run another scene or other options from here on, and note who goes on; return the new record.
+
+        First all checkpoints learn that the new ones are right, too, then the files are replaced: whatever is
+        interrupted, the run can go on, from any of its checkpoints. Rank 0 alone.
+        """
+        scene, options = files.digest_of(scene_text.encode()), files.digest_of(options_text.encode())
+
+        def change(run: Record) -> Record:
+            scenes, choices = _with_last(run.scene, scene), _with_last(run.options, options)
+            return run.model_copy(update={"scene": scenes, "options": choices})
+
+        present = [files.digest(path)[1] for path in (self.scene, self.options)]
+        if present != [scene, options]:
+            change_records(self.checkpoints, change)
+            files.replace_text(self.scene, scene_text)
+            files.replace_text(self.options, options_text)
+        legs = (*(old for old in known.legs if old.step <= leg.step), leg)
+        return known.model_copy(update={"scene": (scene,), "options": (options,), "legs": legs})
+
     def _is_run(self) -> bool:
         return (self.path / MARKER).is_file()
 
-    def _create(self, scene_text: str, options_text: str, overwrite: bool) -> None:
+    def _check_run(self) -> None:
+        if not self._is_run():
+            raise InputError(f"{self.path} is not the directory of a run: it has no {MARKER}")
+        try:
+            about = json.loads(files.read_plain(self.path / MARKER, 4096))
+            number, version = about.get("format", 3), str(about.get("petfsi"))[:40]
+        except (OSError, ValueError, AttributeError, RecursionError):
+            raise InputError(f"{self.path / MARKER} cannot be read") from None
+        if number != FORMAT:
+            raise InputError(
+                f"run directory {self.path} is of format {str(number)[:20]}, by petfsi {version}; this petfsi goes on "
+                f"with format {FORMAT} alone: use that version, or start a new run"
+            )
+        self._check_links()
+
+    def _check_links(self) -> None:
+        """Raise if one of the run's own directories is a link: what would be written there would be elsewhere."""
+        for name in (*_DIRECTORIES, DIRECTORY):
+            if (self.path / name).is_symlink():
+                raise InputError(
+                    f"{self.path / name} is a link, and petfsi follows none in a run directory; put what it names in "
+                    "its place"
+                )
+
+    def _check_place(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"run directory {self.path}: there is a file of that name")
-        if self.path.is_dir() and any(self.path.iterdir()):
-            if not self._is_run():
-                raise InputError(f"run directory {self.path} is not empty and holds no run; name another")
-            if not overwrite:
-                raise InputError(
-                    f"run directory {self.path} holds a run already; continue it with 'petfsi resume {self.path}', "
-                    "replace it with --overwrite, or name another"
-                )
-            self._clear()
+        if not self.path.is_dir() or all(entry.name.startswith(LOCK) for entry in self.path.iterdir()):
+            return
+        if not self._is_run():
+            raise InputError(f"run directory {self.path} is not empty and holds no run; name another")
+        if not overwrite:
+            raise InputError(
+                f"run directory {self.path} holds a run already; continue it with 'petfsi resume {self.path}', "
+                "replace it with --overwrite, or name another"
+            )
+        self._check_links()
+
+    def _create(self, scene_text: str, options_text: str, overwrite: bool, meshes: list[MeshFile]) -> None:
+        self._check_place(overwrite)
         made = [p for p in (self.path, *self.path.parents) if not p.exists()]
+        staged, old = self.path / STAGED, self._is_run()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            # first of all, so that what a crash leaves is still known to be ours
-            files.replace_text(self.path / MARKER, json.dumps({"petfsi": petfsi.__version__}) + "\n")
+            if not old:  # first of all, so that what a crash leaves is still known to be ours
+                self._mark()
+            _remove_meshes(staged)
+            if meshes:
+                files.own_directory(staged)
+                copy_meshes(meshes, staged)  # before the old run goes: they may be its own
+            self._clear()
+            old = False
+            self._mark()
+            if meshes:
+                os.replace(staged, self.path / DIRECTORY)
             files.replace_text(self.scene, scene_text)
             files.replace_text(self.options, options_text)
-        except OSError:
+        except (OSError, InputError):
             with suppress(OSError):
-                self._clear()
-                (self.path / MARKER).unlink(missing_ok=True)
+                _remove_meshes(staged)
+                if not old:
+                    self._clear()
+                    (self.path / MARKER).unlink(missing_ok=True)
                 for directory in made:
                     directory.rmdir()
             raise
 
+    def _mark(self) -> None:
+        about = {"petfsi": petfsi.__version__, "format": FORMAT}
+        files.replace_text(self.path / MARKER, json.dumps(about) + "\n")
+
     def _clear(self) -> None:
-        """Remove what petfsi writes into a run, and nothing else; the marker stays."""
+        """Remove what petfsi writes into a run, and nothing else; the marker and the lock stay."""
         for name in [*_FILES, *(name + ".part" for name in [*_FILES, MARKER])]:
             (self.path / name).unlink(missing_ok=True)
         for name, ours in _DIRECTORIES.items():
             directory = self.path / name
-            if not directory.is_dir():
+            if directory.is_symlink() or not directory.is_dir():
                 continue
             for entry in sorted(os.listdir(directory)):
-                if ours.fullmatch(entry):
+                if ours.fullmatch(entry) and not (directory / entry).is_dir():
                     (directory / entry).unlink()
             with suppress(OSError):  # somebody else's file is in it
                 directory.rmdir()
+        _remove_meshes(self.path / DIRECTORY)
+
+
+def _with_last(digests: tuple[str, ...], last: str) -> tuple[str, ...]:
+    return (*(digest for digest in digests if digest != last), last)
+
+
+def _remove_meshes(directory: Path) -> None:
+    """Remove a run's copies of mesh files; a link and what it names stay."""
+    if directory.is_symlink() or not directory.is_dir():
+        return
+    for folder in directory.iterdir():
+        if folder.name.isdecimal() and folder.is_dir() and not folder.is_symlink():
+            for path in folder.iterdir():
+                path.unlink()
+            folder.rmdir()
+    with suppress(OSError):  # somebody else's file is in it
+        directory.rmdir()

@@ -10,9 +10,12 @@ that it found no data, and shows none.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import get_args
 from xml.etree import ElementTree
+
+from petfsi.output.manifest import Index
 
 #: Shape and NumPy type of every array of a file, by HDF5 path.
 Arrays = Mapping[str, tuple[tuple[int, ...], str]]
@@ -30,8 +33,8 @@ _TOPOLOGY = {
     ("grid", 4): "Quadrilateral",
     ("grid", 8): "Hexahedron",
 }
-#: The index that a run has from the first output time with particles on.
-CLOUDS = "particles.xdmf"
+#: The indexes that a run may have; that of particles from the first output time with some on.
+NAMES: tuple[Index, ...] = get_args(Index)
 _CLOUD = "particles/points"
 
 
@@ -54,8 +57,14 @@ class Entry:
     arrays: Arrays
 
 
-def indexes(mesh: str, static: Arrays, entries: Iterable[Entry], grid: GridInfo | None) -> dict[str, str]:
-    """Return the index files' contents by name, for the parts that the scene has.
+#: What opens and closes the series of all times.
+BEGIN = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n <Domain>\n'
+BEGIN += '  <Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
+END = "  </Grid>\n </Domain>\n</Xdmf>\n"
+
+
+def parts(mesh: str, static: Arrays, entry: Entry, grid: GridInfo | None) -> dict[Index, str]:
+    """Return what an output time adds to the index files, by their names, for the parts that the scene has.
 
     Parameters
     ----------
@@ -63,32 +72,24 @@ def indexes(mesh: str, static: Arrays, entries: Iterable[Entry], grid: GridInfo 
         File of the parts that never change, relative to the run.
     static : mapping
         Its arrays: ``grid/points``, ``grid/cells``, ``solid/reference``, ``solid/cells``, ``solid/body``.
-    entries : iterable of Entry
-        In the order of time.
+    entry : Entry
+        The output time.
     grid : GridInfo or None
         The fluid's grid.
     """
-    entries = list(entries)
-    files = {"fields.xdmf": _document(_both(mesh, static, entry, grid) for entry in entries)}
+    found: dict[Index, ElementTree.Element] = {"fields.xdmf": _both(mesh, static, entry, grid)}
     if "grid/cells" in static:
-        files["fluid.xdmf"] = _document(_timed(_flat_grid(mesh, static, entry), entry) for entry in entries)
+        found["fluid.xdmf"] = _timed(_flat_grid(mesh, static, entry), entry)
     if "solid/cells" in static:
-        files["solid.xdmf"] = _document(
-            _timed(_solid(mesh, static, entry, (mesh, "solid/reference", static)), entry) for entry in entries
-        )
-    with_particles = [entry for entry in entries if _CLOUD in entry.arrays]
-    if with_particles:
-        files[CLOUDS] = _document(_timed(_particles(entry), entry) for entry in with_particles)
-    return files
+        found["solid.xdmf"] = _timed(_solid(mesh, static, entry, (mesh, "solid/reference", static)), entry)
+    if _CLOUD in entry.arrays:
+        found["particles.xdmf"] = _timed(_particles(entry), entry)
+    return {name: _text(element) for name, element in found.items()}
 
 
-def _document(grids: Iterable[ElementTree.Element]) -> str:
-    root = ElementTree.Element("Xdmf", Version="3.0")
-    domain = ElementTree.SubElement(root, "Domain")
-    series = ElementTree.SubElement(domain, "Grid", Name="run", GridType="Collection", CollectionType="Temporal")
-    series.extend(grids)
-    ElementTree.indent(root, " ")
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+def _text(element: ElementTree.Element) -> str:
+    ElementTree.indent(element, " ", level=3)
+    return f"   {ElementTree.tostring(element, encoding='unicode').strip()}\n"
 
 
 def _both(mesh: str, static: Arrays, entry: Entry, grid: GridInfo | None) -> ElementTree.Element:

@@ -5,13 +5,21 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from petfsi.scene.schema import Scene
 
 
-def dump_scene(scene: Scene) -> str:
-    """Return the scene with every default filled in; read again, from any folder, it is an equal scene."""
+def dump_scene(scene: Scene, meshes: Mapping[str, str] | None = None) -> str:
+    """Return the scene with every default filled in; read again, from any folder, it is an equal scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    meshes : mapping of str to str, optional
+        Other names for mesh files, by their paths: those of a run directory's own copies, relative to it.
+    """
     data = scene.model_dump(exclude_none=True, by_alias=True)
     if scene.fluid is not None and scene.dim == 2:
         for side in ("back", "front"):
@@ -19,8 +27,17 @@ def dump_scene(scene: Scene) -> str:
     for item in (*data["solids"].values(), *data["obstacles"].values()):
         if "mesh" in item["shape"]:
             item["shape"]["mesh"] = os.path.abspath(scene.directory / item["shape"]["mesh"])
+    _rename(data, meshes or {})
     _drop_idle(data)
     return "\n".join(_table(data, ())).lstrip("\n") + "\n"
+
+
+def _rename(data: Any, meshes: Mapping[str, str]) -> None:
+    """Give mesh files other names."""
+    if isinstance(data, dict) and isinstance(data.get("mesh"), str):
+        data["mesh"] = meshes.get(data["mesh"], data["mesh"])
+    for item in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
+        _rename(item, meshes)
 
 
 def _drop_idle(data: Any) -> None:
