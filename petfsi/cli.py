@@ -9,12 +9,14 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from petfsi import __version__
+from petfsi.console import open_streams
 from petfsi.errors import PetfsiError
 from petfsi.messages import screen, shown
 
@@ -73,12 +75,12 @@ class SolverCommand(click.Command):
 
 
 _set = click.option("--set", "sets", multiple=True, metavar="KEY=VALUE", help="Override a setting, e.g. time.dt=0.01.")
-_steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps.")
+_steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps, then stop, resumable.")
 _wall = click.option(
     "--wall-limit",
     type=click.FloatRange(min=0, min_open=True),
     metavar="SECONDS",
-    help="Checkpoint and stop, resumable, before this much time has passed.",
+    help="Checkpoint and stop, resumable, before this much time has passed since the process began.",
 )
 
 
@@ -87,8 +89,9 @@ _wall = click.option(
 def cli() -> None:
     """Advance fluids and deformable solids together, solved with PETSc.
 
-    Works alone and under mpirun. Exit codes: 0 done; 2 the scene or the options are wrong; 3 the solve failed or
-    the state blew up; 75 stopped early and resumable.
+    Works alone and under mpirun. Exit codes: 0 done, or as many steps taken as --steps says; 2 the scene or the
+    options are wrong; 3 the solve failed or the state blew up; 75 stopped by a signal or --wall-limit, with a
+    checkpoint; 130 interrupted a second time, at once.
     """
 
 
@@ -300,7 +303,8 @@ def _say(text: str) -> None:
 
 
 def _complain(text: str) -> None:
-    click.echo(f"petfsi: {text}", err=True)
+    with suppress(OSError):  # nobody listens; the exit code still tells
+        click.echo(f"petfsi: {text}", err=True)
 
 
 def _alone(work: Callable[[], int]) -> int:
@@ -390,12 +394,14 @@ def _place(error: BaseException) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code."""
+    open_streams()
     try:
         return cli.main(args=arguments, prog_name="petfsi", standalone_mode=False) or 0
     except click.ClickException as error:
         if _launched_rank() == 0:
             error.__dict__["message"] = screen(error.message)
-            error.show()
+            with suppress(OSError):
+                error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         return INTERRUPTED

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -12,12 +13,26 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+#: Number, name and mode of what a process is given.
+STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
+
 #: What MPI launchers tell a process; Open MPI's gives rank 0 a terminal of its own, wherever its output goes.
 LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK", "MV2_COMM_WORLD_SIZE")
 
 
 def _is_launched() -> bool:
     return any(name in os.environ for name in LAUNCHERS)
+
+
+def open_streams() -> None:
+    """Let what a process was not given of its streams lead nowhere: files opened next would take their numbers."""
+    for number, name, mode in STREAMS:
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, closefd=False))
 
 
 class Console:
@@ -67,7 +82,8 @@ class Console:
         numbers = f"t {time:.4f}  dt {dt:.4g}  its {iterations}  res {residual:.1e}  {seconds:.2f} s"
         self._write(f"step {step}  {numbers}", shown=self._bar is None)
         if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=step, description=numbers)
+            with self._watched() as bar:
+                bar.update(self._task, completed=step, description=numbers)
 
     def note(self, text: str) -> None:
         """Say something once."""
@@ -77,32 +93,47 @@ class Console:
         """Say what a user should look at though the run goes on."""
         self._write(f"warning: {text}")
 
+    def say(self, text: str) -> None:
+        """Say something that the log file has no need of."""
+        self._write(text, logged=False)
+
     def log(self, text: str) -> None:
         """Say something in the log file only."""
         self._write(text, shown=False)
 
-    def _write(self, line: str, shown: bool = True) -> None:
+    def _write(self, line: str, shown: bool = True, logged: bool = True) -> None:
         if not self._speaks:
             return
         if shown and self._bar is not None:
-            self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            with self._watched() as bar:
+                bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         elif shown:
             self._print(line)
-        if self._log is not None:
+        if logged and self._log is not None:
             with suppress(OSError):  # unbuffered: a killed run leaves its last words
                 os.write(self._log, (line + "\n").encode())
+
+    @contextmanager
+    def _watched(self) -> Iterator[Progress]:
+        """Give the bar up when its terminal has gone."""
+        assert self._bar is not None
+        try:
+            yield self._bar
+        except OSError:
+            self._bar = None
 
     def _print(self, line: str) -> None:
         try:
             print(line, flush=True)
-        except OSError:
+        except (OSError, ValueError):
             # what is left in the buffer would be tried again, and complained of, when Python ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def close(self) -> None:
         """Take the bar down and close the log."""
         if self._bar is not None:
-            self._bar.stop()
+            with self._watched() as bar:
+                bar.stop()
             self._bar = None
         if self._log is not None:
             os.close(self._log)

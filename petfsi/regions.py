@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.fields.base import PressureFluid, Reader, Slab, SolidField
+from petfsi.fields.base import PressureFluid, Reader, Slab, SolidField, State
 from petfsi.lasting import TABLES, Tracked, bounded_most, looked_up, meeting, pairs
 from petfsi.system import System
 
@@ -422,10 +423,16 @@ class ClosedRegions:
 
     # ---- what others read -------------------------------------------------------------------------------------
 
-    def state(self) -> dict[str, Slab]:
-        """Return by cell and by facet which lasting region it lies in or bounds, and what is known of that."""
+    def keep(self) -> Callable[[], State]:
+        """Return what gives, later, by cell and by facet which lasting region it lies in or bounds now.
+
+        And what is known of that: what is tracked is replaced, never changed.
+        """
         assert self._tracked is not None
-        known, comm = self._tracked, self.system.comm
+        return partial(self._state, self._tracked)
+
+    def _state(self, known: Tracked) -> State:
+        comm = self.system.comm
         facets = known.facets
         n, mine = len(facets), slice(*_share(len(facets), comm))
         arrays = {}

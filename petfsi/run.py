@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-import signal
+import re
 import time as clock
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -16,8 +16,10 @@ from mpi4py import MPI
 
 from petfsi import __version__, petsc, solve
 from petfsi.console import Console
+from petfsi.effort import Effort, earlier_effort, summed
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
+from petfsi.kept import Kept
 from petfsi.messages import shown
 from petfsi.options import Options
 from petfsi.output import checkpoint as checkpoints
@@ -27,7 +29,7 @@ from petfsi.output.lock import Lock, held, refuse_if_held
 from petfsi.output.manifest import Leg, Record
 from petfsi.output.mesh_files import mesh_files, own_names
 from petfsi.output.rundir import RunDirectory
-from petfsi.output.summary import Summary, write_summary
+from petfsi.output.summary import Summary, read_summary, write_summary
 from petfsi.output.xdmf import GridInfo
 from petfsi.plan import MAX_COUNTED, skipped
 from petfsi.ranks import on_root
@@ -36,45 +38,14 @@ from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 from petfsi.simulation import Simulation
+from petfsi.stop import Stop
 
 DONE, STOPPED = 0, 75
 #: Lines about what is wrong with a run directory.
 MAX_TOLD = 8
 Status = Literal["done", "stopped", "failed"]
-
-
-class Stop:
-    """Whether the run should stop early: a signal, or the wall-time limit.
-
-    SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP on any rank stop all ranks at the same step.
-    """
-
-    def __init__(self, comm: MPI.Comm, wall_limit: float | None) -> None:
-        self.comm = comm
-        self.limit = wall_limit
-        self.start = clock.monotonic()
-        self._signal = 0
-        for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP):
-            signal.signal(number, self._hear)  # after PETSc has put its own in
-
-    def _hear(self, number: int, _frame: object) -> None:
-        self._signal = number
-
-    def asked(self, slowest_step: float) -> str:
-        """Return why to stop, or nothing. Collective: one reduction.
-
-        Parameters
-        ----------
-        slowest_step : float
-            Seconds that the slowest step took: one more must fit under the limit.
-        """
-        late = self.limit is not None and clock.monotonic() - self.start + slowest_step > self.limit
-        everyone = np.array([self._signal, int(late)])
-        self.comm.Allreduce(MPI.IN_PLACE, everyone, MPI.MAX)
-        number, late = everyone.tolist()
-        if number:
-            return signal.Signals(number).name
-        return f"the wall-time limit of {self.limit:g} s" if late else ""
+#: What those who write files say of checkpoints.
+_LAST_GOOD = re.compile(r"\s*(Last good checkpoint: .*\.h5\.|There is no checkpoint\.)")
 
 
 class Run:
@@ -90,21 +61,24 @@ class Run:
         self.console = console
         self.comm = simulation.comm
         self._begin = clock.perf_counter()
-        self.iterations: list[int] = []
-        self.volume_error = 0.0
+        self.effort = Effort()
         self.probes: dict[str, float] = {}
-        self._slowest = 0.0
+        self._saved: int | None = None
+        self._row = -1
+        self._slowest = self._writing = 0.0
 
     def open(self, after: int | None = None) -> None:
-        """Open what the run writes; of a run that goes on drop all after a step. Collective."""
+        """Open what the run writes; of a run that goes on drop all after a step, that of its checkpoint. Collective."""
         simulation = self.simulation
         simulation.report = self.console.note
-        others = [*self.effort(), *self.flaws(), *simulation.accounts.columns]
+        others = [*self.counts(), *self.flaws(), *simulation.accounts.columns]
         columns = column_names(simulation.probe_columns(), others)
         self.history = History(self.files.history, columns, self.comm, self.known.history)
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
         if after is not None:
             self.writer.go_on(self.known, after, self.fields, self.console.warn)
+            self.effort = earlier_effort(self.files, after, self.comm, self.console.note)
+            self._saved = after
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
@@ -118,7 +92,8 @@ class Run:
             if first:
                 self.files.free_reserve()
                 with suppress(OSError, SolveError):  # what has failed already is the message, not this
-                    write_summary(self.files.summary, self.summary("failed"), MPI.COMM_SELF)
+                    why = str(error).split("\n")[0]
+                    write_summary(self.files.summary, self.summary("failed", why), MPI.COMM_SELF)
                 self.console.log(f"failed: {error}")
             raise
         finally:
@@ -126,58 +101,93 @@ class Run:
                 self.files.free_reserve()
 
     def loop(self, steps: int | None, stop: Stop) -> int:
-        """Step until the scene's end, or ``steps`` times; return the exit status. Collective."""
+        """Step until the scene's end, or ``steps`` times, or until told to stop; return the exit status. Collective."""
         simulation = self.simulation
         last = None if steps is None else simulation.step + steps
-        done = simulation.finished
-        while not done:
+        while not simulation.finished and simulation.step != last:
+            why = stop.asked(self._slowest + self._writing)
+            if why:
+                return self.end("stopped", why)
             begin = clock.perf_counter()
-            self.advance()
-            done = simulation.finished or simulation.step == last
-            with simulation.phase("observe"):
-                self.observe(final=done)
+            self.take_step(last)
             seconds = clock.perf_counter() - begin
             self._slowest = max(self._slowest, seconds)
             outcome = simulation.outcome
             self.console.step(
                 simulation.step, simulation.time, simulation.dt, outcome.iterations, outcome.residual, seconds
             )
-            why = "" if done else stop.asked(self._slowest)
-            if why:
-                self.checkpoint()
-                self.summarise("stopped")
-                here = f"stopped by {why} after step {simulation.step}"
-                self.console.note(f"{here}; go on with: petfsi resume {self.files.path}")
-                return STOPPED
-        self.checkpoint()
-        self.summarise("done")
+        if simulation.finished:
+            return self.end("done")
+        self.end("stopped", f"--steps {steps}")
         return DONE
 
+    def end(self, status: Status, why: str = "") -> int:
+        """Leave a checkpoint of the present step, and a summary; return the exit status. Collective."""
+        step = self.simulation.step
+        if self._saved != step:
+            self.checkpoint()
+        self.summarise(status, why)
+        if status == "done":
+            return DONE
+        self.console.note(f"stopped by {why} after step {step}; go on with: petfsi resume {self.files.path}")
+        return STOPPED
+
+    def take_step(self, last: int | None) -> None:
+        """Take a step and write what is due; leave the state before it if that fails. Collective.
+
+        Raises
+        ------
+        SolveError
+            On all ranks; what is wrong with the scene only now has become the step's failure.
+        """
+        simulation = self.simulation
+        before = None if self._saved == simulation.step else Kept.of(simulation)
+        try:
+            self.advance()
+            final = simulation.finished or simulation.step == last
+            with simulation.phase("observe"):
+                self.observe(final)
+        except SolveError as error:
+            what = _LAST_GOOD.sub("", str(error))  # there may be a newer one now
+            raise SolveError(f"{what}\n{self.rescue(before)}") from error
+        every = simulation.scene.checkpoint.every
+        if every and not final and self._due(every):
+            with simulation.phase("observe"):
+                self.checkpoint()
+
     def advance(self) -> None:
-        """Take one step; what is wrong with the scene only now has become the step's failure. Collective."""
+        """Take one step. Collective."""
         simulation = self.simulation
         try:
             simulation.advance()
         except (SolveError, InputError) as error:
             now = simulation.time + simulation.dt
-            last = checkpoints.last_good(self.files.checkpoints, self.comm)
-            raise SolveError(f"step {simulation.step + 1}, t = {now:.6g} s: {error}\n{last}") from error
+            raise SolveError(f"step {simulation.step + 1}, t = {now:.6g} s: {error}") from error
+
+    def rescue(self, before: Kept | None) -> str:
+        """Write a checkpoint of the state before a failed step, if it is good; say where to go on. Collective."""
+        newest = checkpoints.find_checkpoint(self.files.checkpoints, self.comm, lambda _line: None)
+        if before is not None and before.is_finite() and (newest is None or newest.step < before.step):
+            with suppress(SolveError):  # the disk that has failed, as a rule
+                if self._row > before.step:  # then the step's fields could not be written
+                    self.history.drop_last()
+                self._write_checkpoint(before)
+        last = checkpoints.last_good(self.files.checkpoints, self.comm)
+        resumable = before is not None or newest is not None
+        return f"{last} Go on from there with: petfsi resume {self.files.path}" if resumable else last
 
     def observe(self, final: bool) -> None:
-        """Write what is due after a step. Collective."""
+        """Write the row, and the fields if they are due, after a step. Collective."""
         simulation = self.simulation
-        scene = simulation.scene
+        every = simulation.scene.output.every
         if self.lock is not None:
             self.lock.touch()
-        self.iterations.append(simulation.outcome.iterations)
-        self.volume_error = max(self.volume_error, simulation.volume_error)
+        self.effort.add_step(simulation.outcome.iterations, simulation.volume_error)
         self.append_row()
-        if scene.output.every and (final or self._due(scene.output.every)):
+        if every and (final or self._due(every)):
             self.write_fields()
-        if scene.checkpoint.every and not final and self._due(scene.checkpoint.every):
-            self.checkpoint()
 
-    def effort(self) -> dict[str, int]:
+    def counts(self) -> dict[str, int]:
         """Return what the last step took besides iterations; what no step of the scene can take is left out."""
         simulation = self.simulation
         newton = {"newton": simulation.outcome.newton} if simulation.solver.iterates else {}
@@ -202,11 +212,12 @@ class Run:
                 **self.probes,
                 "iterations": simulation.outcome.iterations,
                 "residual": simulation.outcome.residual,
-                **self.effort(),
+                **self.counts(),
                 **self.flaws(),
                 **simulation.accounts.values,
             }
         )
+        self._row = simulation.step
 
     def _due(self, every: float) -> bool:
         now, dt = self.simulation.time, self.simulation.dt
@@ -221,49 +232,53 @@ class Run:
         self.writer.write(self.simulation.step, self.simulation.time, self.fields())
 
     def checkpoint(self) -> None:
-        """Write a checkpoint, and let the solver forget what a resumed run could not know. Collective.
+        """Write a checkpoint, and let the solver forget what a resumed run could not know. Collective."""
+        begin = clock.perf_counter()
+        self._write_checkpoint(Kept.of(self.simulation))
+        self.simulation.forget()
+        self._writing = max(self._writing, clock.perf_counter() - begin)
 
-        What the checkpoint counts is on the disk before it.
-        """
-        simulation = self.simulation
+    def _write_checkpoint(self, kept: Kept) -> None:
+        """Write a checkpoint; what it counts is on the disk before it. Collective."""
         present = {"history": self.history.on_disk(), **self.writer.on_disk()}
         checkpoints.write_checkpoint(
             self.files.checkpoints,
-            simulation.step,
-            simulation.time,
-            simulation.dt,
-            simulation.state(),
+            kept.step,
+            kept.time,
+            kept.dt,
+            kept.state(),
             {"version": __version__},
             self.comm,
-            simulation.scene.checkpoint.keep,
+            self.simulation.scene.checkpoint.keep,
             self.known.model_copy(update=present),
         )
-        simulation.forget()
+        self._saved = kept.step
 
     def conservation(self) -> dict[str, float]:
         """Return what the run kept, and how well. Not collective."""
         simulation = self.simulation
         of_pressure = simulation.fluid is None or simulation.regions is not None
-        return ({"volume_error": self.volume_error} if of_pressure else {}) | simulation.accounts.values
+        largest = {"volume_error": self.effort.volume_error} if of_pressure else {}
+        return largest | simulation.accounts.values
 
-    def summarise(self, status: Status) -> None:
+    def summarise(self, status: Status, why: str) -> None:
         """Write summary.json. Collective."""
-        write_summary(self.files.summary, self.summary(status), self.comm)
+        write_summary(self.files.summary, self.summary(status, why), self.comm)
 
-    def summary(self, status: Status) -> Summary:
+    def summary(self, status: Status, why: str) -> Summary:
         """Return what the run was so far. Not collective."""
-        simulation = self.simulation
-        iterations = self.iterations or [0]
+        simulation, before = self.simulation, self.effort
         return Summary(
             status=status,
+            reason=why,
             steps=simulation.step,
             time=simulation.time,
             ranks=self.comm.size,
             unknowns=simulation.system.unknowns,
-            wall_s=clock.perf_counter() - self._begin,
-            phases=simulation.phases,
-            iterations={"mean": float(np.mean(iterations)), "max": max(iterations)},
-            assemblies=simulation.assemblies(),
+            wall_s=before.wall_s + clock.perf_counter() - self._begin,
+            phases=summed(before.phases, simulation.phases),
+            iterations=before.mean_and_max(),
+            assemblies=summed(before.assemblies, simulation.assemblies()),
             conservation=self.conservation(),
             probes=self.probes,
             skipped=skipped(simulation.scene),
@@ -355,6 +370,12 @@ def resume_run(
         unread = simulation.prepare(resumes=True)
         _restore(simulation, found)
         with Console(comm.rank, files.log, total=_total(scene, None)) as console:
+            if simulation.finished and on_root(comm, lambda: _is_done(files, found.step)):
+                console.say(
+                    f"{directory}: this run is done, at step {found.step}, t = {found.time:.6g} s; nothing was "
+                    f"changed. To go on, give it a later end: petfsi resume {directory} --set time.end=..."
+                )
+                return DONE
             for line in damaged:
                 console.warn(line)
             _greet(console, simulation, options, unread)
@@ -387,6 +408,15 @@ def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str]) ->
         sets=tuple(sets),
         options=tuple(options),
     )
+
+
+def _is_done(files: RunDirectory, step: int) -> bool:
+    """Return whether a run has said that it is done; one that was killed at its end goes on to say so."""
+    try:
+        told = read_summary(files.summary)
+        return (told["status"], told["steps"]) == ("done", step)
+    except (InputError, KeyError, TypeError):
+        return False
 
 
 def _total(scene: Scene, steps: int | None) -> int | None:

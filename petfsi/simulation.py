@@ -15,7 +15,7 @@ from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
-from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, Slab, SolidField
+from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held
 from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
@@ -425,18 +425,20 @@ class Simulation:
             },
         }
 
-    def state(self) -> dict[str, dict[str, Slab]]:
+    def state(self) -> dict[str, State]:
         """Return all that the next step reads: by field, closed regions, what accounts add to, and the stable step."""
-        states = {field.name: field.state() for field in self.fields}
+        return {name: part() for name, part in self.keep().items()}
+
+    def keep(self) -> dict[str, Callable[[], State]]:
+        """Return what gives ``state`` of now, whatever steps are tried since. Collective, and so is each of it."""
+        kept = {field.name: field.keep() for field in self.fields}
         if self.regions:
-            states["regions"] = self.regions.state()
+            kept["regions"] = self.regions.keep()
         if self.accounts.columns:
-            states["accounts"] = self.accounts.state()
-        if self.accounts.columns:
-            states["guard"] = self.guard.state()
+            kept["accounts"], kept["guard"] = held(self.accounts.state()), held(self.guard.state())
         if self.stable.limited:
-            states["stable"] = self.stable.state(self.comm)
-        return states
+            kept["stable"] = held(self.stable.state(self.comm))
+        return kept
 
     def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:
         """Take up the state of a checkpoint; ``prepare`` comes first. Collective.

@@ -42,9 +42,10 @@ def here(capfd):
     """Return a function that runs a command in this process."""
 
     from petfsi import cli
+    from petfsi.stop import SIGNALS
 
     def run(*words):
-        before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)}
+        before = {number: signal.getsignal(number) for number in SIGNALS}
         capfd.readouterr()
         code = cli.main([str(word) for word in words])
         out, err = capfd.readouterr()

@@ -373,7 +373,7 @@ def test_a_solver_that_does_not_converge_is_named(scene, ranks):
     slowly = ["--set", "fluid.sides.left.inflow.ramp=0.2"]
     done = petfsi("run", scene, "--out", "out", *slowly, *WEAK, ranks=ranks)
     has_failed(done, "out", "step 1, t = 0.05 s: solver 'fsi_", "DIVERGED_MAX_IT", "by field: solid ", ", pressure ")
-    assert "There is no checkpoint." in done.stderr
+    assert "Last good checkpoint: out/checkpoint/000000.h5. Go on from there with: petfsi resume out" in done.stderr
     assert len(read_history("out/history.csv")["step"]) == 1
 
 
@@ -412,7 +412,12 @@ def test_a_state_that_blows_up_ends_the_run_and_names_the_checkpoint(tmp_path, r
     ],
 )
 def test_what_goes_wrong_only_later_is_a_failed_step(scene, here, setting, said):
-    has_failed(here("run", scene, "--out", "out", "--set", setting), "out", *said, "There is no checkpoint.")
+    done = here("run", scene, "--out", "out", "--set", setting)
+    has_failed(done, "out", *said)
+    told = json.loads(Path("out/summary.json").read_text())
+    last = read_history("out/history.csv")["step"][-1]
+    assert told["steps"] == last and f"Last good checkpoint: out/checkpoint/{last:06d}.h5." in done.stderr
+    assert all(text in told["reason"] for text in said)
 
 
 #: What numbers cannot hold, where NumPy would warn before anyone judges: settings, exit code, what is said.

@@ -32,7 +32,7 @@ def goes_on(scene, *options, forgets=True, before=4, after=3):
     with prepared(scene, *options) as straight, prepared(scene, *options) as again:
         for _ in range(before):
             straight.advance()
-        arrays = stored(straight)
+        arrays, kept = stored(straight), straight.keep()
         if forgets:
             straight.forget()
         again.forget()
@@ -45,6 +45,10 @@ def goes_on(scene, *options, forgets=True, before=4, after=3):
             want, got = stored(straight), stored(again)
             different = [(g, name) for g in want for name in want[g] if not np.array_equal(want[g][name], got[g][name])]
             assert want.keys() == got.keys() and not different
+        for group, part in kept.items():  # what is kept of a state does not change with it
+            for name, slab in part().items():
+                place = tuple(slice(a, a + n) for a, n in zip(slab.start, slab.data.shape, strict=True))
+                assert np.array_equal(slab.data, arrays[group][name][place], equal_nan=True), (group, name)
     return straight
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -32,6 +32,16 @@ class Slab:
     data: np.ndarray
     start: tuple[int, ...]
     shape: tuple[int, ...]
+
+
+#: By name the arrays of a state.
+State = dict[str, Slab]
+
+
+def held(state: State) -> Callable[[], State]:
+    """Return what gives a state as it is now, whatever becomes of the arrays it was made of."""
+    copy = {name: replace(slab, data=slab.data.copy()) for name, slab in state.items()}
+    return lambda: copy
 
 
 def scalar_slab(comm: MPI.Comm, value: float) -> Slab:
@@ -231,8 +241,12 @@ class Field(ABC):
         """Return what pictures and other programs want to see."""
 
     @abstractmethod
-    def state(self) -> dict[str, Slab]:
-        """Return all that the next step reads."""
+    def state(self) -> State:
+        """Return all that the next step reads. Collective."""
+
+    def keep(self) -> Callable[[], State]:
+        """Return what gives ``state`` of now, whatever steps are tried since. Collective, and so is what it returns."""
+        return held(self.state())
 
     @abstractmethod
     def restore(self, read: Reader) -> None:

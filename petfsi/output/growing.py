@@ -46,6 +46,7 @@ class Table:
     def __init__(self, path: Path, digest: hashlib.blake2b, size: int, rows: int) -> None:
         self.path = path
         self._digest, self._size, self._rows = digest, size, rows
+        self._before = digest.copy(), size, rows
 
     @classmethod
     def begun(cls, path: Path, header: str) -> Table:
@@ -87,9 +88,15 @@ class Table:
             raise
         finally:
             os.close(handle)
+        self._before = self._digest.copy(), self._size, self._rows
         self._digest.update(data)
         self._size += len(data)
         self._rows += 1
+
+    def drop_last(self) -> None:
+        """Take the last line that was appended back, once."""
+        self._digest, self._size, self._rows = self._before
+        self.cut()
 
     def on_disk(self) -> Rows:
         """Return how much there is, once it is on the disk."""

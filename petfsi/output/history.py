@@ -65,6 +65,10 @@ class History:
         """
         self._on_root(lambda: self._write(row))
 
+    def drop_last(self) -> None:
+        """Take the last row back, that of a step of which not all could be written. Collective."""
+        self._on_root(lambda: self._table.drop_last() if self._table else None)
+
     def on_disk(self) -> Rows:
         """Return how many rows there are, once they are on the disk. Collective.
 

@@ -19,12 +19,14 @@ from petfsi.ranks import on_root
 
 @dataclass
 class Summary:
-    """The keys of ``summary.json``.
+    """The keys of ``summary.json``. A run that was resumed has one part for each time that it was.
 
     Attributes
     ----------
     status : str
         ``done``, ``stopped`` (resumable) or ``failed``.
+    reason : str
+        Why it stopped or failed.
     steps : int
         Steps finished since time zero, over all resumed parts.
     time : float
@@ -34,13 +36,13 @@ class Summary:
     unknowns : dict
         By field.
     wall_s : float
-        Wall time, s.
+        Wall time of all parts, s; not of those that were killed, which leave no summary.
     phases : dict
-        Wall time of predict, couple, assemble, solve, accept and observe, s.
+        Wall time of predict, couple, assemble, solve, accept and observe, s; of all parts.
     iterations : dict
-        ``mean`` and ``max`` over the steps.
+        ``mean`` and ``max`` over the steps of all parts.
     assemblies : dict
-        How often each field's block and each coupling's blocks were assembled.
+        How often each field's block and each coupling's blocks were assembled, in all parts.
     conservation : dict
         Volume error, energies, ...
     probes : dict
@@ -54,6 +56,7 @@ class Summary:
     status: Literal["done", "stopped", "failed"]
     steps: int
     time: float
+    reason: str = ""
     ranks: int = 1
     unknowns: dict[str, int] = field(default_factory=dict)
     wall_s: float = 0.0

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
 from numba import njit
 
 from petfsi.errors import SolveError
-from petfsi.fields.base import Reader, Slab, scalar_slab
+from petfsi.fields.base import Reader, Slab, State, scalar_slab
 from petfsi.fields.sph.balance import Boxes, bisect, is_better, is_uneven, located, seen
 from petfsi.fields.sph.cells import CellGrid, sorted_rows
 from petfsi.fields.sph.transport import Packing, Traffic, ship
@@ -337,12 +338,19 @@ class Swarm:
 
         Where ids have no gaps, row i is the particle with the i-th smallest id.
         """
+        return self.keep(names)()
+
+    def keep(self, names: Iterable[str] | None = None) -> Callable[[], State]:
+        """Return what gives ``slabs`` of now, whatever becomes of the particles. Not collective; what it returns is."""
         chosen = self._with_id(names)
-        own = np.flatnonzero(self.owned)
-        last = self.comm.allreduce(int(self._columns["id"][own].max(initial=0)), MPI.MAX)
-        share = last // self.comm.size + 1
+        return partial(self._slabs, chosen, self._packing(chosen).pack(self._columns, np.flatnonzero(self.owned)))
+
+    def _slabs(self, chosen: Sequence[str], own: np.ndarray) -> State:
         packing = self._packing(chosen)
-        words = ship(self.comm, packing.pack(self._columns, own), self["id"][own] // share)
+        number = packing.column(own, "id")
+        last = self.comm.allreduce(int(number.max(initial=0)), MPI.MAX)
+        share = last // self.comm.size + 1
+        words = ship(self.comm, own, number // share)
         rows = words[np.argsort(packing.column(words, "id"))]
         ends = np.cumsum(self.comm.allgather(len(rows)))
         start, n = int(ends[self.comm.rank]) - len(rows), int(ends[-1])

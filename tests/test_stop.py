@@ -1,0 +1,195 @@
+"""How runs stop early, and what a failed or stopped one leaves to go on from. About 20 s."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+from processes import environment
+
+from petfsi import cli
+from petfsi.kept import Kept
+from petfsi.output.history import read_history
+from petfsi.stop import SIGNALS, Stop, process_age
+
+PETFSI = Path(sys.executable).with_name("petfsi")
+
+#: A block held by its left side falls: twelve steps without a fluid.
+SCENE = """
+dim = 2
+gravity = [0.0, "GRAVITY"]
+[time]
+end = 0.6
+dt = 0.05
+[solids.block]
+shape = { box = { origin = [0.0, 0.0], size = [1.0, 1.0], cells = [2, 2] } }
+density = 20.0
+young = 1e4
+poisson = 0.3
+supports = [{ where = "left", fix = ["x", "y"] }]
+[checkpoint]
+every = 0.2
+"""
+
+
+@pytest.fixture
+def handlers():
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, capfd, handlers):
+    """Return a function that runs a command in this process and returns its exit code and all that it said."""
+    monkeypatch.chdir(tmp_path)
+    Path("block.toml").write_text(SCENE.replace("GRAVITY", "-1 - t"))
+
+    def run(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        options = sys.modules["petsc4py.PETSc"].Options()
+        for name in options.getAll():
+            options.delValue(name)
+        return code, "".join(capfd.readouterr())
+
+    return run
+
+
+def summary(directory="out"):
+    return json.loads(Path(directory, "summary.json").read_text())
+
+
+def arrays(path):
+    found = {}
+    with h5py.File(path, driver="mpio", comm=MPI.COMM_SELF) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+# ---- signals and time ---------------------------------------------------------------------------------------
+
+
+def test_signals_are_heard_unless_they_were_ignored(handlers):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    for number in set(SIGNALS) - {signal.SIGHUP}:
+        signal.signal(number, signal.default_int_handler)
+        stop = Stop(MPI.COMM_SELF, None)
+        assert stop.asked(1e9) == ""
+        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), number)
+        assert stop.asked(0.0) == signal.Signals(number).name
+
+
+#: Takes signals while it is in one call of C, in which Python sees none.
+IN_C = """
+import ctypes, time
+from mpi4py import MPI
+from petfsi.stop import Stop
+stop = Stop(MPI.COMM_SELF, None)
+print("ready", flush=True)
+ctypes.PyDLL(None).sleep(1)
+end = time.monotonic() + 20
+while time.monotonic() < end:
+    ctypes.PyDLL(None).usleep(int(1e6 * (end - time.monotonic())))
+"""
+
+
+def test_the_second_interrupt_ends_a_process_in_whatever_it_is():
+    with subprocess.Popen([sys.executable, "-c", IN_C], env=environment(), stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"ready\n"
+        begin = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == -signal.SIGINT  # a shell calls that 130
+        assert time.monotonic() - begin < 15
+
+
+def test_the_wall_limit_counts_from_the_start_of_the_process(handlers):
+    code = "import time; time.sleep(0.5); from petfsi.stop import process_age; print(process_age())"
+    done = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True)
+    assert float(done.stdout) >= 0.5
+    stop = Stop(MPI.COMM_SELF, process_age() + 100.0)
+    assert stop.asked(50.0) == "" and stop.asked(101.0).startswith("the wall-time limit of ")
+
+
+def test_a_limit_that_set_up_takes_up_stops_before_the_first_step(here):
+    code, said = here("run", "block.toml", "--out", "out", "--wall-limit", "0.001")
+    assert code == 75 and "stopped by the wall-time limit of 0.001 s after step 0" in said
+    assert here("resume", "out", "--steps", "1")[0] == 0 and summary()["steps"] == 1
+
+
+# ---- what is left -------------------------------------------------------------------------------------------
+
+
+def test_steps_end_in_a_run_that_goes_on_and_its_summary_counts_all_parts(here):
+    code, said = here("run", "block.toml", "--out", "out", "--steps", "5")
+    first = summary()
+    assert code == 0 and "stopped by --steps 5 after step 5; go on with: petfsi resume out" in said
+    assert (first["status"], first["reason"], first["steps"]) == ("stopped", "--steps 5", 5)
+    assert here("resume", "out")[0] == 0
+    second = summary()
+    assert (second["status"], second["reason"], second["steps"]) == ("done", "", 12)
+    iterations = read_history(Path("out/history.csv"))["iterations"][1:]
+    assert second["iterations"] == {"mean": pytest.approx(iterations.mean()), "max": iterations.max()}
+    assert second["wall_s"] > first["wall_s"] and second["assemblies"]["solid"] >= 12
+    assert all(second["phases"][name] > first["phases"][name] for name in ("assemble", "solve"))
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"wall_s": "x"}', '{"wall_s": NaN, "phases": {}}', "[" * 5000, None])
+def test_a_damaged_summary_is_told_and_loses_nothing_else(here, content):
+    here("run", "block.toml", "--out", "out", "--steps", "5")
+    Path("out/summary.json").unlink() if content is None else Path("out/summary.json").write_text(content)
+    code, said = here("resume", "out")
+    told = "there is no summary.json: " if content is None else "summary.json is damaged: "
+    assert code == 0 and told + "seconds and assemblies of earlier parts are not counted" in said
+    assert summary()["steps"] == 12 and len(read_history(Path("out/history.csv"))["step"]) == 13
+
+
+def test_resuming_a_finished_run_says_so_and_changes_nothing(here):
+    here("run", "block.toml", "--out", "out")
+    before = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in Path("out").rglob("*") if p.is_file()}
+    code, said = here("resume", "out")
+    assert code == 0 and "this run is done, at step 12, t = 0.6 s; nothing was changed" in said
+    assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in Path("out").rglob("*") if p.is_file()} == before
+    assert here("resume", "out", "--set", "time.end=0.7")[0] == 0 and summary()["steps"] == 14
+
+
+@pytest.mark.parametrize("end, last", [("0.27", 5), ("0.22", 4)], ids=["newer", "none newer"])
+def test_a_failed_step_leaves_the_state_before_it(here, end, last):
+    wrong = ["--set", f'gravity=["0*log({end} - t)", "-1 - t"]']
+    code, said = here("run", "block.toml", "--out", "out", *wrong)
+    path = f"out/checkpoint/{last:06d}.h5"
+    assert code == 3 and f"Last good checkpoint: {path}. Go on from there with: petfsi resume out" in said
+    assert summary()["status"] == "failed" and f"step {last + 1}, t = " in summary()["reason"]
+    assert here("resume", "out")[0] == 3  # as it would again, from there
+    here("run", "block.toml", "--out", "good", "--steps", str(last), *wrong)
+    want, got = arrays(f"good/checkpoint/{last:06d}.h5"), arrays(path)
+    assert want.keys() == got.keys() and all(np.array_equal(want[name], got[name]) for name in want)
+
+
+def test_a_state_that_is_no_number_is_not_left(here, monkeypatch):
+    monkeypatch.setattr(Kept, "is_finite", lambda self: False)
+    code, said = here("run", "block.toml", "--out", "out", "--set", 'gravity=["0*log(0.12 - t)", "-1"]')
+    assert code == 3 and "There is no checkpoint." in said and not list(Path("out/checkpoint").glob("*"))
+
+
+# ---- nobody listens -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", ">/dev/full"])
+def test_a_run_that_nobody_can_hear_goes_on(here, closed):
+    line = f"exec {PETFSI} run block.toml --out out {closed}"
+    assert subprocess.run(["bash", "-c", line], env=environment(), timeout=180).returncode == 0
+    assert Path("out/log.txt").read_text().count("\nstep ") == 12
+    assert summary()["status"] == "done"
