@@ -18,25 +18,28 @@ from petfsi import __version__, petsc, solve
 from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
+from petfsi.legs import describe_changes, find_changes, judge_changes
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
 from petfsi.output.lock import Lock, held, refuse_if_held
-from petfsi.output.manifest import Leg, Record
+from petfsi.output.manifest import Change, Leg, Record
 from petfsi.output.mesh_files import mesh_files, own_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
 from petfsi.plan import MAX_COUNTED, default_options, skipped
 from petfsi.ranks import on_root
-from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
+from petfsi.scene.changes import RESUMABLE
+from petfsi.scene.load import dump_scene, load_scene
 from petfsi.scene.schema import Scene
-from petfsi.scene.stepping import Stepping
 from petfsi.simulation import Simulation
 
 DONE, STOPPED = 0, 75
 #: Lines about what is wrong with a run directory.
 MAX_TOLD = 8
+#: Columns of history.csv that a scene has, or not, by what may change when its run goes on.
+SPARE = ("newton", "substeps", "potential", "load_work")
 Status = Literal["done", "stopped", "failed"]
 
 
@@ -98,7 +101,9 @@ class Run:
         simulation.report = self.console.note
         others = [*self.effort(), *self.flaws(), *simulation.accounts.columns]
         columns = column_names(simulation.probe_columns(), others)
-        self.history = History(self.files.history, columns, self.comm, self.known.history)
+        self.history = History(self.files.history, columns, self.comm, self.known.history, SPARE)
+        if absent := set(columns) - set(self.history.columns):
+            self.console.note(f"{self.files.history} keeps its columns: {', '.join(sorted(absent))} will not be in it")
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
         if after is not None:
             self.writer.go_on(self.known, after, self.fields, self.console.warn)
@@ -199,7 +204,9 @@ class Run:
                 **self.probes,
                 "iterations": simulation.outcome.iterations,
                 "residual": simulation.outcome.residual,
-                **self.effort(),
+                "newton": simulation.outcome.newton,
+                "substeps": simulation.substeps,
+                **simulation.accounts.sums,
                 **self.flaws(),
                 **simulation.accounts.values,
             }
@@ -314,7 +321,7 @@ def run_scene(
         files = RunDirectory.create(out, text, solve.dump_options(), overwrite, comm, meshes)
         leg = _leg(simulation, sets, petsc_args)
         known = on_root(comm, lambda: files.first_record(meshes, leg))
-        with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
+        with Console(comm.rank, files.log, total=_total(simulation, steps)) as console:
             _greet(console, simulation, unread)
             run = Run(simulation, files, console, known, lock)
             with run.recorded():
@@ -352,18 +359,24 @@ def resume_run(
         solve.load_options(petsc_args, base=files.options)
         simulation = Simulation(comm, scene)
         # of the scene's start: it would move the fluid's faces to the restored solid
-        unread = simulation.prepare(resumes=True)
+        unread = simulation.prepare(resumes_at=found.time)
         _restore(simulation, found)
-        with Console(comm.rank, files.log, total=_total(scene, None)) as console:
+        text, options = dump_scene(scene, own_names(list(known.meshes), directory)), solve.dump_options()
+        changes = find_changes(known, text, options)
+        judge_changes(scene, changes, found.time)
+        if changes and not simulation.finished:
+            simulation.check_step()
+        with Console(comm.rank, files.log, total=_total(simulation, None)) as console:
             for line in damaged:
                 console.warn(line)
             _greet(console, simulation, unread)
             console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
             run = Run(simulation, files, console, known, lock)
             run.open(after=found.step)
-            text = dump_scene(scene, own_names(list(known.meshes), directory))
-            options, leg = solve.dump_options(), _leg(simulation, sets, petsc_args)
+            leg = _leg(simulation, sets, petsc_args, changes)
             run.known = on_root(comm, lambda: files.change(known, text, options, leg))
+            for line in describe_changes(changes, found.step, found.time):
+                console.note(line)
             with run.recorded():
                 return run.loop(steps, stop)
 
@@ -378,7 +391,7 @@ def _restore(simulation: Simulation, found: checkpoints.CheckpointInfo) -> None:
             raise InputError(f"checkpoint {found.path} holds no state of this scene: {what}") from error
 
 
-def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str]) -> Leg:
+def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str], changes: tuple[Change, ...] = ()) -> Leg:
     return Leg(
         step=simulation.step,
         time=simulation.time,
@@ -386,12 +399,13 @@ def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str]) ->
         petfsi=__version__,
         sets=tuple(sets),
         options=tuple(options),
+        changes=changes,
     )
 
 
-def _total(scene: Scene, steps: int | None) -> int | None:
+def _total(simulation: Simulation, steps: int | None) -> int | None:
     """Return the number of the last step, for the bar; None where counting would take long."""
-    known = [n for n in (Stepping(scene.time).count(MAX_COUNTED), steps) if n is not None]
+    known = [n for n in (simulation.last_step(MAX_COUNTED), steps) if n is not None]
     return min(known, default=None)
 
 

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petfsi.errors import InputError
+from petfsi.scene.changes import RESUMABLE
 from petfsi.scene.checks import RESERVED_PROBES, check_inside_grid, expressions
-from petfsi.scene.load import RESUMABLE, apply_set, dump_scene, load_scene, parse_value, scene_from_dict
+from petfsi.scene.load import apply_set, dump_scene, load_scene, parse_value, scene_from_dict
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 
