@@ -19,11 +19,12 @@ from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
 from petfsi.legs import describe_changes, find_changes, judge_changes
+from petfsi.origin import Origin
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
 from petfsi.output.lock import Lock, held, refuse_if_held
-from petfsi.output.manifest import Change, Leg, Record
+from petfsi.output.manifest import Change, Leg, OriginMark, Record
 from petfsi.output.mesh_files import mesh_files, own_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, write_summary
@@ -302,24 +303,26 @@ def run_scene(
     wall_limit: float | None,
     overwrite: bool,
     sets: Sequence[str] = (),
+    source: Path | None = None,
 ) -> int:
-    """Run a scene into a new directory; return the exit status. Collective.
+    """Run a scene into a new directory, from the state of the run in ``source`` if any; return the exit status.
 
-    Everything that can be wrong with the scene and the options is found before the directory is made.
+    Collective. Everything that can be wrong with the scene and the options is found before the directory is made.
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
     on_root(comm, lambda: RunDirectory.check_place(out, overwrite))
     on_root(comm, lambda: refuse_if_held(out))
+    origin = Origin.find(source, out, comm) if source is not None else None
     meshes = on_root(comm, lambda: mesh_files(scene))
     solve.load_options(petsc_args, base=Path(on_root(comm, lambda: default_options(scene))))
     simulation = Simulation(comm, scene)
-    unread = simulation.prepare()
+    unread = origin.begin(simulation) if origin is not None else simulation.prepare()
     simulation.probe()
     text = dump_scene(scene, own_names([mesh.mark for mesh in meshes], out))
     with held(out, comm, make=True) as lock:
         files = RunDirectory.create(out, text, solve.dump_options(), overwrite, comm, meshes)
-        leg = _leg(simulation, sets, petsc_args)
+        leg = _leg(simulation, sets, petsc_args, origin=None if origin is None else origin.mark)
         known = on_root(comm, lambda: files.first_record(meshes, leg))
         with Console(comm.rank, files.log, total=_total(simulation, steps)) as console:
             _greet(console, simulation, unread)
@@ -391,7 +394,13 @@ def _restore(simulation: Simulation, found: checkpoints.CheckpointInfo) -> None:
             raise InputError(f"checkpoint {found.path} holds no state of this scene: {what}") from error
 
 
-def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str], changes: tuple[Change, ...] = ()) -> Leg:
+def _leg(
+    simulation: Simulation,
+    sets: Sequence[str],
+    options: Sequence[str],
+    changes: tuple[Change, ...] = (),
+    origin: OriginMark | None = None,
+) -> Leg:
     return Leg(
         step=simulation.step,
         time=simulation.time,
@@ -400,6 +409,7 @@ def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str], ch
         sets=tuple(sets),
         options=tuple(options),
         changes=changes,
+        origin=origin,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -475,21 +475,42 @@ class Simulation:
         group : callable
             Returns the reader of a group of ``state`` by its name.
         """
-        self.forget()  # of the scene's start
         self.step, self.time, self.dt = step, time, dt
         length, begin, start = (float(group("clock")(name, (0,), (1,))[0]) for name in CLOCK)
         self._stepping.go_on(step, time, (length, int(begin), start))
-        for field in self.fields:
-            field.restore(group(field.name))
-        if self.solid and self.watch:
-            self.watch.resume(self.solid)
-        for coupling in self.couplings:
-            coupling.restored()
-        if self.regions:
-            self.regions.restore(group("regions"))
+        self.begin_with([field.name for field in self.fields], group)
         if self.accounts.columns:
             self.accounts.restore(group("accounts"))
         if self.accounts.columns:
             self.guard.restore(group("guard"))
         if self.stable.limited:
             self.stable.restore(group("stable"))
+
+    def begin_with(self, names: Collection[str], group: Callable[[str], Reader]) -> None:
+        """Take up the state of some fields of a checkpoint: after ``prepare`` all, before it others. Collective.
+
+        Parameters
+        ----------
+        names : collection of str
+            Of fields.
+        group : callable
+            Returns the reader of a group of ``state`` by its name.
+        """
+        whole = len(names) == len(self.fields)
+        if whole:
+            self.forget()  # of the scene's start
+        for field in self.fields:
+            if field.name in names:
+                field.restore(group(field.name))
+        if self.solid and self.watch:
+            self.watch.resume(self.solid)
+        for coupling in self.couplings:
+            coupling.restored()
+        if self.regions and whole:
+            self.regions.restore(group("regions"))
+
+    def begin_accounts(self) -> None:
+        """Open the books anew for the present state, that of another run's checkpoint. Collective."""
+        self.accounts.start()
+        if self.regions:
+            self.regions.go_on()

@@ -271,6 +271,17 @@ class CheckpointReader:
         """Return the names of the fields that have state here."""
         return sorted(self._file)
 
+    def unread(self) -> list[str]:
+        """Return the arrays that nothing has read, as ``group/array``, of whole groups the group. Not collective."""
+        read = {name.split("/")[0] for name in self._ends}
+        return sorted(
+            {
+                name if name.split("/")[0] in read else name.split("/")[0]
+                for name in self._shapes
+                if name not in self._ends
+            }
+        )
+
     def group(self, name: str) -> Reader:
         """Return the reader of one field's state.
 

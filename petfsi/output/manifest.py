@@ -57,10 +57,20 @@ class Change(_Entry):
     new: str | None
 
 
+class OriginMark(_Entry):
+    """The checkpoint of another run that one began with."""
+
+    file: str
+    step: Count
+    time: Seconds
+    blake2b: Digest
+
+
 class Leg(_Entry):
     """A part of a run by one process, with what it was told: ``--set`` and PETSc's options as given.
 
-    ``changes`` is how its settings differ from those that the checkpoint was written with.
+    ``changes`` is how its settings differ from those that the checkpoint was written with, ``origin`` whose state a
+    first leg began with.
     """
 
     step: Count
@@ -70,6 +80,7 @@ class Leg(_Entry):
     sets: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     changes: tuple[Change, ...] = ()
+    origin: OriginMark | None = None
 
 
 class Record(_Entry):

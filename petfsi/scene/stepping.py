@@ -48,10 +48,19 @@ class Stepping:
         t : float
         stored : tuple of float, int, float
             What ``stored`` was then.
+
+        Raises
+        ------
+        ValueError
+            If that does not lead to t.
         """
-        length, *origin = stored
-        same = self.constant and length == self.length(t)
-        self._origin = (int(origin[0]), float(origin[1])) if same else (step, t)
+        length, begin, start = stored
+        if not (self.constant and length == self.length(t)):
+            self._origin = step, t
+        elif abs(start + (step - begin) * length - t) <= SLACK * length:
+            self._origin = begin, start
+        else:
+            raise ValueError(f"its clock does not lead to t = {t:g} s in {step} steps")
 
     @property
     def stored(self) -> tuple[float, int, float]:
