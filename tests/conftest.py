@@ -1,6 +1,8 @@
 """What every test shares: one thread per rank, and of the parallel tests those for the present number of ranks."""
 
 import os
+import signal
+import subprocess
 import sys
 
 for name, value in {
@@ -33,3 +35,25 @@ def pytest_runtest_logreport(report):
     if report.failed and MPI.COMM_WORLD.size > 1:
         print(f"\n{report.nodeid}\n{report.longreprtext}", file=sys.__stdout__, flush=True)
         MPI.COMM_WORLD.Abort(1)
+
+
+@pytest.fixture
+def here(capfd):
+    """Return a function that runs a command in this process."""
+
+    from petfsi import cli
+
+    def run(*words):
+        before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)}
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        out, err = capfd.readouterr()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if "petsc4py.PETSc" in sys.modules:
+            options = sys.modules["petsc4py.PETSc"].Options()
+            for name in options.getAll():
+                options.delValue(name)
+        return subprocess.CompletedProcess(words, code, out, err)
+
+    return run

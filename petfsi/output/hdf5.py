@@ -28,6 +28,7 @@ from mpi4py import MPI
 
 from petfsi.errors import PetfsiError
 from petfsi.fields.base import Slab
+from petfsi.output import files
 from petfsi.ranks import agree, on_root
 
 #: Room for the file's own tables, beyond the data: in all, and for every dataset.
@@ -97,7 +98,7 @@ def write_file(
 def _lay_out(path: Path, arrays: Mapping[str, Slab], attributes: Mapping[str, Any], views: Mapping[str, View]) -> None:
     """Create the file with everything but the data, and make sure of the space for the data."""
     tables = _TABLES + _TABLES_EACH * (len(arrays) + len(views))
-    with _naming(path), open(path, "wb") as file:
+    with _naming(path), open(files.new_file(path), "wb") as file:
         os.truncate(file.fileno(), n_bytes(arrays) + tables)
         _set_aside(file.fileno(), tables)
     with h5py.File(path, "w") as file:

@@ -140,7 +140,7 @@ def known_rows(path: Path, known: Rows) -> tuple[Table, bytes]:
 
 def _rows(path: Path) -> tuple[list[str] | None, list[list[str]]]:
     """Return header and whole rows as text; a last row without its line end is left out."""
-    with open(path, encoding="utf-8", errors="replace", newline="") as file:
+    with open(files.open_plain(path), encoding="utf-8", errors="replace", newline="") as file:
         lines = file.read().split("\n")[:-1]
     if not lines:
         return None, []

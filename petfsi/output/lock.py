@@ -28,9 +28,12 @@ from petfsi.ranks import on_root
 
 #: The lock's name in a run directory.
 NAME = ".lock"
+#: Stands for a moment beside it while the lock of a process that is gone is taken over.
+TAKING = f"{NAME}.taking"
 #: Seconds between two touches of a lock that is held.
 BEAT = 10.0
 _TRIES = 20
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 _MAX_BYTES = 4096
 
 
@@ -162,7 +165,8 @@ def acquire(directory: Path) -> Lock:
         if lock is not None:
             return lock
         time.sleep(0.05)
-    raise InputError(f"run directory {directory}: others take its lock {path} all the time")
+    taking = path.with_name(TAKING)
+    raise InputError(f"run directory {directory}: another process takes its lock; if none does, remove {taking}")
 
 
 def _make(path: Path) -> Lock | None:
@@ -173,9 +177,9 @@ def _make(path: Path) -> Lock | None:
     except FileExistsError:
         os.close(handle)
         return None
-    except OSError as error:  # a file system without hard links
+    except OSError as error:
         os.close(handle)
-        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
+        if error.errno not in _NO_LINKS:
             raise
         return _make_plainly(path)
     finally:
@@ -184,6 +188,7 @@ def _make(path: Path) -> Lock | None:
 
 
 def _make_plainly(path: Path) -> Lock | None:
+    """Do the same where the file system knows no hard links."""
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
     except FileExistsError:
@@ -224,14 +229,21 @@ def _take_over(path: Path) -> Lock | None:
     old = _open_old(path)
     if old is None:
         return None
+    taking = path.with_name(TAKING)
     try:
         _judge(path, old)
-        # where flock works only one process comes here; a last look makes sure that the lock is still the old one
-        if not _same(path, old):
+        # of several that come to this, one at a time looks again and takes it
+        guard = _make_plainly(taking)
+        if guard is None:
             return None
-        own, handle = _written(path)
-        os.replace(own, path)
-        return Lock(path, handle)
+        try:
+            if not _same(path, old):
+                return None
+            own, handle = _written(path)
+            os.replace(own, path)
+            return Lock(path, handle)
+        finally:
+            guard.release()
     finally:
         os.close(old)
 
