@@ -20,7 +20,7 @@ from petfsi.output.manifest import OriginMark
 from petfsi.output.mesh_files import mesh_files
 from petfsi.output.rundir import RunDirectory
 from petfsi.ranks import on_root
-from petfsi.scene.dump import as_toml
+from petfsi.scene.dump import as_toml, drop_idle
 from petfsi.scene.load import load_scene
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
@@ -118,7 +118,11 @@ class Origin:
             if whole:
                 unread = simulation.prepare(resumes_at=0.0)
                 simulation.begin_with(taken, group)
-                simulation.begin_accounts()
+                simulation.rehearse(resumes_at=0.0)  # books are opened, and solutions looked for, where bodies are now
+                simulation.accounts.start()
+                simulation.begin_with(taken, group)  # that has moved the fluid's faces to them
+                if simulation.regions:
+                    simulation.regions.go_on()
                 simulation.check_step()
             else:
                 simulation.begin_with(taken, group)
@@ -202,6 +206,7 @@ def _read_anew(read: Reader, name: str, start: tuple[int, ...], count: tuple[int
 def _layout(scene: Scene, taken: list[str]) -> dict[str, str]:
     """Return by key, as TOML, what the state of some fields hangs on. Not collective: reads meshes."""
     data, meshes = scene.model_dump(exclude_none=True, by_alias=True), _digests(scene)
+    drop_idle(data)
     found = {"dim": scene.dim, "solids": ", ".join(scene.solids)}
     for name, solid in data["solids"].items():
         found[f"solids.{name}.shape"] = _with_digests(solid["shape"], meshes)

@@ -508,9 +508,3 @@ class Simulation:
             coupling.restored()
         if self.regions and whole:
             self.regions.restore(group("regions"))
-
-    def begin_accounts(self) -> None:
-        """Open the books anew for the present state, that of another run's checkpoint. Collective."""
-        self.accounts.start()
-        if self.regions:
-            self.regions.go_on()

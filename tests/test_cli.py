@@ -83,7 +83,7 @@ def test_run_passes_everything_on(scene, calls):
     status = cli.main(
         ["run", str(scene), "--set", "time.dt=0.05", "-fsi_ksp_rtol", "1e-6", "--out", "somewhere", "-log_view"]
         + ["--steps=7", "-shift", "-1.5", "--overwrite", "--wall-limit", "60", "-options_file", "split.opts"]
-        + ["--set", "solids.sheet.young=2e5"]
+        + ["--set", "solids.sheet.young=2e5", "--from", "runs/old"]
     )
     assert status == 0
     (loaded, out, steps, petsc, wall_limit, overwrite) = calls[0]

@@ -28,7 +28,7 @@ def dump_scene(scene: Scene, meshes: Mapping[str, str] | None = None) -> str:
         if "mesh" in item["shape"]:
             item["shape"]["mesh"] = os.path.abspath(scene.directory / item["shape"]["mesh"])
     _rename(data, meshes or {})
-    _drop_idle(data)
+    drop_idle(data)
     return "\n".join(_table(data, ())).lstrip("\n") + "\n"
 
 
@@ -40,12 +40,12 @@ def _rename(data: Any, meshes: Mapping[str, str]) -> None:
         _rename(item, meshes)
 
 
-def _drop_idle(data: Any) -> None:
+def drop_idle(data: Any) -> None:
     """Leave out the mesh scale of shapes that are no mesh."""
     if isinstance(data, dict) and "scale" in data and "mesh" not in data:
         del data["scale"]
     for item in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
-        _drop_idle(item)
+        drop_idle(item)
 
 
 def _table(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
