@@ -64,8 +64,8 @@ class Stepping:
 
     @property
     def stored(self) -> tuple[float, int, float]:
-        """The length of equal steps (s; 0 where they are not) and from which step and time (s) they are counted."""
-        return (self.length(self._origin[1]) if self.constant else 0.0, *self._origin)
+        """The length of equal steps (s) and from which step and time (s) they are counted; zeros of other steps."""
+        return (self.length(self._origin[1]), *self._origin) if self.constant else (0.0, 0, 0.0)
 
     def length(self, t: float, stable: float | None = None) -> float:
         """Return the length of the step that begins at t, s.
