@@ -169,6 +169,8 @@ class FieldWriter:
         """
         try:
             said, whole = on_root(self.comm, lambda: self._look(known, step))
+            # all ranks must know alike whether there is a mesh.h5: they write it together
+            self._static, self._mesh_mark = self.comm.bcast((self._static, self._mesh_mark))
             if not whole:
                 self._write_mesh(groups().get("solid", {}))
             said += on_root(self.comm, lambda: self._take_up_indexes(known, bool(said)))
