@@ -53,6 +53,26 @@ cells = [10, 12]
 [fluid.sides]
 top = "open"
 """
+DAM = """
+dim = 2
+gravity = [0.0, -9.81]
+[time]
+end = 1.0
+dt = "auto"
+[fluid]
+kind = "sph"
+density = 1000.0
+origin = [0.0, 0.0]
+size = [0.6, 0.6]
+spacing = 0.04
+sound_speed = 25.0
+fill = [{ box = { origin = [0.0, 0.0], size = [0.2, 0.3] } }]
+[fluid.sides]
+top = "open"
+[probes.front]
+of = "fluid"
+quantity = "front"
+"""
 #: What changes after step 5, at t = 0.5, and the setting of a scene in which that is so from the start.
 CHANGED = {
     "dt": ("time.dt=0.04", 'time.dt="where(t < 0.45, 0.1, 0.04)"'),
@@ -309,6 +329,32 @@ def test_a_run_from_another_goes_on_as_that_does(scene, command, integrator, wat
     assert new["energy_residual"][0] == new["load_work"][0] == 0.0
     mark = newest("new").run.legs[0].origin
     assert mark.file.endswith("old/checkpoint/000005.h5") and (mark.step, mark.time) == (5, 0.5)
+
+
+def test_particles_go_on_and_begin_anew(scene, command):
+    Path(scene).write_text(DAM)
+    command("run", scene, "--out", "old", "--steps", 8)
+    command("run", scene, "--out", "new", "--from", "old", "--steps", 4)
+    said = command("run", scene, "--out", "other", "--from", "old", "--set", "fluid.spacing=0.02", code=2)
+    assert "the state of particles there is of another layout:\n  fluid.spacing = 0.02, and was 0.04" in said
+    shutil.copytree("old", "heavy")
+    command("resume", "old", "--steps", 4)
+    old, new = (read_history(Path(run, "history.csv")) for run in ("old", "new"))
+    for name in ("front", "kinetic", "dt"):
+        np.testing.assert_allclose(old[name][9:], new[name][1:], rtol=1e-13, err_msg=name)
+    command("resume", "heavy", "--steps", 4, "--set", "gravity=[2.0, -9.81]", "--set", "time.dt=0.0005")
+    heavy = read_history(Path("heavy/history.csv"))
+    np.testing.assert_allclose(np.diff(heavy["time"])[8:], 0.0005)
+    assert heavy["momentum.x"][-1] > old["momentum.x"][-1]
+
+
+def test_gravity_that_gives_particles_their_sound_stays(scene, command):
+    Path(scene).write_text(DAM.replace("sound_speed = 25.0", ""))
+    command("run", scene, "--out", "old", "--steps", 1)
+    assert "sound_speed" in command("resume", "old", "--set", "gravity=[0, -5]", code=2)
+    assert "gravity = [0, -5]" in command(
+        "run", scene, "--from", "old", "--out", "new", "--set", "gravity=[0, -5]", code=2
+    )
 
 
 def test_a_body_at_rest_under_its_load_is_put_into_water(scene, command):
