@@ -352,9 +352,8 @@ def test_gravity_that_gives_particles_their_sound_stays(scene, command):
     Path(scene).write_text(DAM.replace("sound_speed = 25.0", ""))
     command("run", scene, "--out", "old", "--steps", 1)
     assert "sound_speed" in command("resume", "old", "--set", "gravity=[0, -5]", code=2)
-    assert "gravity = [0, -5]" in command(
-        "run", scene, "--from", "old", "--out", "new", "--set", "gravity=[0, -5]", code=2
-    )
+    said = command("run", scene, "--from", "old", "--out", "new", "--set", "gravity=[0, -5]", code=2)
+    assert "gravity = [0.0, -5.0], and was [0.0, -9.81]" in said
 
 
 def test_a_body_at_rest_under_its_load_is_put_into_water(scene, command):
@@ -433,3 +432,4 @@ def test_ranks_may_be_others(scene, command):
         np.testing.assert_allclose(many[name], one[name], rtol=1e-7, atol=1e-10, err_msg=name)
     assert json.loads(Path("many/summary.json").read_text())["ranks"] == 1
     assert re.search(r"changed after step 2, t = 0.2 s: time.dt", Path("many/log.txt").read_text())
+    assert [change.key for change in newest("many").run.legs[-1].changes] == ["time.dt", "solids.b.damping.mass"]
