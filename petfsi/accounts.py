@@ -101,6 +101,11 @@ class Accounts:
         """The names of the columns, in order."""
         return list(self.values)
 
+    @property
+    def sums(self) -> dict[str, float]:
+        """What was summed over the steps, J, that of columns left out as well."""
+        return dict(zip(SUMMED, self._sums.tolist(), strict=True))
+
     def start(self) -> None:
         """Open the books for the present state. Collective."""
         if self._wanted:
@@ -169,7 +174,7 @@ class Accounts:
     def state(self) -> dict[str, Slab]:
         """Return the present row, where it began, and what the next one reads. Collective."""
         power = self._power
-        numbers = self.values | {"initial_energy": self._initial, "began": float(power is not None)}
+        numbers = self.sums | self.values | {"initial_energy": self._initial, "began": float(power is not None)}
         numbers["exchanged"] = self.exchanged
         if power is not None:
             numbers |= {f"power_{name}": value for name, value in zip(SUMMED, power.tolist(), strict=True)}
@@ -183,7 +188,7 @@ class Accounts:
 
         self.values = {name: number(name) for name in self.values}
         self._initial, self.exchanged = number("initial_energy"), number("exchanged")
-        self._sums[:] = [self.values.get(name, 0.0) for name in SUMMED]
+        self._sums[:] = [number(name) for name in SUMMED]
         began = number("began") > 0
         self._power = np.array([number(f"power_{name}") for name in SUMMED]) if began else None
         self._solid.restore(read, began)

@@ -101,6 +101,13 @@ def cli() -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="Run directory; runs/<scene> by default.")
 @_steps
 @click.option("--overwrite", is_flag=True, help="Replace the run that stands in the run directory.")
+@click.option(
+    "--from",
+    "source",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Begin at t = 0 with the state in the last good checkpoint of the run in DIR.",
+)
 @_wall
 @click.pass_context
 def run(
@@ -110,6 +117,7 @@ def run(
     out: Path | None,
     steps: int | None,
     overwrite: bool,
+    source: Path | None,
     wall_limit: float | None,
 ) -> NoReturn:
     """Run SCENE, a TOML file, into a new run directory."""
@@ -123,7 +131,7 @@ def run(
         _start_petsc(petsc, comm)
         from petfsi.run import run_scene
 
-        return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets)
+        return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets, source)
 
     ctx.exit(_together(work))
 
@@ -139,7 +147,8 @@ def resume(
 ) -> NoReturn:
     """Go on with the run in DIR from its last good checkpoint.
 
-    --set may change time.end, [output] and [checkpoint] only.
+    --set may change [time] but its integrator, gravity, damping, body_force and loads of solids, output.every and
+    [checkpoint]; PETSc options may change, too. The run remembers that.
     """
     petsc = ctx.meta["petsc"]
 

@@ -13,6 +13,10 @@ class InputError(PetfsiError):
     exit_code = 2
 
 
+class NotStoredError(InputError):
+    """A checkpoint has no such array."""
+
+
 class SolveError(PetfsiError):
     """A solve failed or the state blew up: exit code 3."""
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from petfsi.couplings.base import Coupling
+from petfsi.errors import NotStoredError
 from petfsi.fields.base import Forces, Reader, Slab, SolidField
 from petfsi.integrators import Integrator
 
@@ -88,6 +89,13 @@ class ForceWork:
         if solid is None or not self._lead:
             return
         names = solid.acting if began else self._forces
-        self._forces = {name: solid.read_stored(read, f"before_{name}") for name in names}
+        self._forces = {name: self._read(read, solid, f"before_{name}") for name in names}
         if self._late and self._forces:
-            self._way = solid.read_stored(read, "before_way")
+            self._way = self._read(read, solid, "before_way")
+
+    def _read(self, read: Reader, solid: SolidField, name: str) -> np.ndarray:
+        """Return what was stored; zeros of a force that has come since, by another gravity or loads. Collective."""
+        try:
+            return solid.read_stored(read, name)
+        except NotStoredError:
+            return np.zeros(solid.layout.n_local)

@@ -7,13 +7,16 @@ from mpi4py import MPI
 from petfsi import solve
 from petfsi.memory import refuse_too_large
 from petfsi.options import Options
+from petfsi.origin import Origin
 from petfsi.plan import default_options
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 
 
-def made_ready(comm: MPI.Comm, scene: Scene, petsc_args: list[str]) -> tuple[Simulation, list[str], Options]:
+def made_ready(
+    comm: MPI.Comm, scene: Scene, petsc_args: list[str], origin: Origin | None = None
+) -> tuple[Simulation, list[str], Options]:
     """Return the simulation of a scene, ready for its first step, options that nothing reads, and all. Collective.
 
     Writes nothing: everything that can be wrong with the scene and the options is found here, its probes included.
@@ -31,6 +34,6 @@ def made_ready(comm: MPI.Comm, scene: Scene, petsc_args: list[str]) -> tuple[Sim
     on_root(comm, lambda: refuse_too_large(scene, ranks=ranks))
     options = solve.load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
     simulation = Simulation(comm, scene)
-    unread = simulation.prepare()
+    unread = simulation.prepare() if origin is None else origin.begin(simulation)
     simulation.probe()
     return simulation, unread, options

@@ -75,6 +75,7 @@ class ClosedRegions:
         self.decoupled = decoupled
         self._tracked: Tracked | None = None
         self._accepted: Tracked | None = None
+        self._starts = True  # at time zero, from a scene's start
         self._found_for: tuple[int, ...] | None = None
         self._attached_for: tuple[int, ...] | None = None
         self._members: list[np.ndarray] = []
@@ -296,6 +297,10 @@ class ClosedRegions:
         """Whether any region's volume can be closed."""
         return self._walls is not None and not self.decoupled and bool(self._elastic.any())
 
+    def go_on(self) -> None:
+        """Take the state restored for that of a run under way, whatever its time."""
+        self._starts = False
+
     def aim(self, time: float, dt: float) -> None:
         """Give the fluid the sources that lead to the regions' volumes at the end of a step of dt. Collective."""
         self.fluid.source = None
@@ -307,7 +312,7 @@ class ClosedRegions:
             change = self._walls.slope(self.solid.surface_shift())
         else:
             change = self._walls.change(self.solid.surface_arrival(None, dt))
-        half = self._first_half(dt) if landing.swings and time == 0.0 else np.zeros_like(change)
+        half = self._first_half(dt) if landing.swings and time == 0.0 and self._starts else np.zeros_like(change)
         here, change, half = self.system.comm.allreduce(np.array([self._inflows(), change, half]))
 
         def of(table: dict[int, float]) -> np.ndarray:

@@ -20,13 +20,15 @@ from petfsi.effort import Effort, earlier_effort, summed
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
 from petfsi.kept import Kept
+from petfsi.legs import describe_changes, find_changes, judge_changes
 from petfsi.messages import shown
 from petfsi.options import Options
+from petfsi.origin import Origin
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names
 from petfsi.output.lock import Lock, held, refuse_if_held
-from petfsi.output.manifest import Leg, Record
+from petfsi.output.manifest import Change, Leg, OriginMark, Record
 from petfsi.output.mesh_files import mesh_files, own_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import Summary, read_summary, write_summary
@@ -34,15 +36,17 @@ from petfsi.output.xdmf import GridInfo
 from petfsi.plan import MAX_COUNTED, skipped
 from petfsi.ranks import on_root
 from petfsi.ready import made_ready
-from petfsi.scene.load import RESUMABLE, dump_scene, load_scene
+from petfsi.scene.changes import RESUMABLE
+from petfsi.scene.load import dump_scene, load_scene
 from petfsi.scene.schema import Scene
-from petfsi.scene.stepping import Stepping
 from petfsi.simulation import Simulation
 from petfsi.stop import Stop
 
 DONE, STOPPED = 0, 75
 #: Lines about what is wrong with a run directory.
 MAX_TOLD = 8
+#: Columns of history.csv that a scene has, or not, by what may change when its run goes on.
+SPARE = ("newton", "substeps", "potential", "load_work")
 Status = Literal["done", "stopped", "failed"]
 #: What those who write files say of checkpoints.
 _LAST_GOOD = re.compile(r"\s*(Last good checkpoint: .*\.h5\.|There is no checkpoint\.)")
@@ -73,7 +77,9 @@ class Run:
         simulation.report = self.console.note
         others = [*self.counts(), *self.flaws(), *simulation.accounts.columns]
         columns = column_names(simulation.probe_columns(), others)
-        self.history = History(self.files.history, columns, self.comm, self.known.history)
+        self.history = History(self.files.history, columns, self.comm, self.known.history, SPARE)
+        if absent := set(columns) - set(self.history.columns):
+            self.console.note(f"{self.files.history} keeps its columns: {', '.join(sorted(absent))} will not be in it")
         self.writer = FieldWriter(self.files.path, self.comm, _grid_info(simulation))
         if after is not None:
             self.writer.go_on(self.known, after, self.fields, self.console.warn)
@@ -212,7 +218,9 @@ class Run:
                 **self.probes,
                 "iterations": simulation.outcome.iterations,
                 "residual": simulation.outcome.residual,
-                **self.counts(),
+                "newton": simulation.outcome.newton,
+                "substeps": simulation.substeps,
+                **simulation.accounts.sums,
                 **self.flaws(),
                 **simulation.accounts.values,
             }
@@ -313,23 +321,25 @@ def run_scene(
     wall_limit: float | None,
     overwrite: bool,
     sets: Sequence[str] = (),
+    source: Path | None = None,
 ) -> int:
-    """Run a scene into a new directory; return the exit status. Collective.
+    """Run a scene into a new directory, from the state of the run in ``source`` if any; return the exit status.
 
-    Everything that can be wrong with the scene and the options is found before the directory is made.
+    Collective. Everything that can be wrong with the scene and the options is found before the directory is made.
     """
     comm = MPI.COMM_WORLD
     stop = Stop(comm, wall_limit)
     on_root(comm, lambda: RunDirectory.check_place(out, overwrite))
     on_root(comm, lambda: refuse_if_held(out))
+    origin = Origin.find(source, out, comm) if source is not None else None
     meshes = on_root(comm, lambda: mesh_files(scene))
-    simulation, unread, options = made_ready(comm, scene, petsc_args)
+    simulation, unread, options = made_ready(comm, scene, petsc_args, origin)
     text = dump_scene(scene, own_names([mesh.mark for mesh in meshes], out))
     with held(out, comm, make=True) as lock:
         files = RunDirectory.create(out, text, options.dump(), overwrite, comm, meshes)
-        leg = _leg(simulation, sets, petsc_args)
+        leg = _leg(simulation, sets, petsc_args, origin=None if origin is None else origin.mark)
         known = on_root(comm, lambda: files.first_record(meshes, leg))
-        with Console(comm.rank, files.log, total=_total(scene, steps)) as console:
+        with Console(comm.rank, files.log, total=_total(simulation, steps)) as console:
             _greet(console, simulation, options, unread)
             run = Run(simulation, files, console, known, lock)
             with run.recorded():
@@ -367,9 +377,14 @@ def resume_run(
         options = solve.load_options(petsc_args, stored=files.options)
         simulation = Simulation(comm, scene)
         # of the scene's start: it would move the fluid's faces to the restored solid
-        unread = simulation.prepare(resumes=True)
+        unread = simulation.prepare(resumes_at=found.time)
         _restore(simulation, found)
-        with Console(comm.rank, files.log, total=_total(scene, None)) as console:
+        text = dump_scene(scene, own_names(list(known.meshes), directory))
+        changes = find_changes(known, text, options.dump())
+        judge_changes(scene, changes, found.time)
+        if changes and not simulation.finished:
+            simulation.check_step()
+        with Console(comm.rank, files.log, total=_total(simulation, None)) as console:
             if simulation.finished and on_root(comm, lambda: _is_done(files, found.step)):
                 console.say(
                     f"{directory}: this run is done, at step {found.step}, t = {found.time:.6g} s; nothing was "
@@ -382,9 +397,10 @@ def resume_run(
             console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
             run = Run(simulation, files, console, known, lock)
             run.open(after=found.step)
-            text = dump_scene(scene, own_names(list(known.meshes), directory))
-            leg = _leg(simulation, sets, petsc_args)
+            leg = _leg(simulation, sets, petsc_args, changes)
             run.known = on_root(comm, lambda: files.change(known, text, options.dump(), leg))
+            for line in describe_changes(changes, found.step, found.time):
+                console.note(line)
             with run.recorded():
                 return run.loop(steps, stop)
 
@@ -399,7 +415,13 @@ def _restore(simulation: Simulation, found: checkpoints.CheckpointInfo) -> None:
             raise InputError(f"checkpoint {found.path} holds no state of this scene: {what}") from error
 
 
-def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str]) -> Leg:
+def _leg(
+    simulation: Simulation,
+    sets: Sequence[str],
+    options: Sequence[str],
+    changes: tuple[Change, ...] = (),
+    origin: OriginMark | None = None,
+) -> Leg:
     return Leg(
         step=simulation.step,
         time=simulation.time,
@@ -407,6 +429,8 @@ def _leg(simulation: Simulation, sets: Sequence[str], options: Sequence[str]) ->
         petfsi=__version__,
         sets=tuple(sets),
         options=tuple(options),
+        changes=changes,
+        origin=origin,
     )
 
 
@@ -419,9 +443,9 @@ def _is_done(files: RunDirectory, step: int) -> bool:
         return False
 
 
-def _total(scene: Scene, steps: int | None) -> int | None:
+def _total(simulation: Simulation, steps: int | None) -> int | None:
     """Return the number of the last step, for the bar; None where counting would take long."""
-    known = [n for n in (Stepping(scene.time).count(MAX_COUNTED), steps) if n is not None]
+    known = [n for n in (simulation.last_step(MAX_COUNTED), steps) if n is not None]
     return min(known, default=None)
 
 

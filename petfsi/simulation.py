@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -15,7 +15,7 @@ from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
-from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held
+from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
 from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
@@ -24,6 +24,9 @@ from petfsi.solve import Outcome, Solver
 from petfsi.substeps import StableStep
 from petfsi.system import System
 from petfsi.touch import watch
+
+#: By what equal steps are counted: their length, from which step and time.
+CLOCK = ("length", "step", "time")
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
 
@@ -146,6 +149,23 @@ class Simulation:
             return self._stepping.length(t)
         return min(self._stepping.length(t, self.stable.present()[0]), self.scene.output.every or np.inf)
 
+    def check_step(self) -> None:
+        """Refuse a next step, of a run that goes on, that has no length or is longer than the stable one. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks.
+        """
+        try:
+            self.stable.count(self.time, self._length(self.time))
+        except SolveError as error:
+            raise InputError(str(error)) from error
+
+    def last_step(self, most: int) -> int | None:
+        """Return the number of the last step; None where they differ and are more than ``most``. Not collective."""
+        return self._stepping.count(most)
+
     def _take(self, t: float, dt: float, retries: int) -> None:
         """Take a step, or two halves in its place if it fails and so on, at most ``retries`` times. Collective."""
         try:
@@ -198,29 +218,37 @@ class Simulation:
         for field in self.fields:
             field.forget()
 
-    def prepare(self, resumes: bool = False) -> list[str]:
+    def prepare(self, resumes_at: float | None = None) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
 
-        Then let the velocities of fluid and solids fit each other, unless a run ``resumes`` with those of a checkpoint.
+        Then let the velocities of fluid and solids fit each other, unless a run resumes with those of a checkpoint.
         Collective. Returns the options of others that nothing reads.
+
+        Parameters
+        ----------
+        resumes_at : float, optional
+            The time (s) of that checkpoint: a step must have a length then, which it need not have at time zero.
 
         Raises
         ------
         SolveError
             On all ranks, if that start cannot be found.
         """
-        self.rehearse()
+        self.rehearse(resumes_at)
         with causes.elements_named(self.solid):
             unread = self.solver.check_options()
         self.accounts.start()
-        if not resumes:
+        if resumes_at is None:
             self._fit_velocities()
         return unread
 
-    def rehearse(self) -> None:
+    def rehearse(self, resumes_at: float | None = None) -> None:
         """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
-        self.dt = self._length(self.time)
-        self.stable.count(self.time, self.dt)
+        if resumes_at is None:
+            self.dt = self._length(self.time)
+            self.stable.count(self.time, self.dt)
+        else:
+            self.dt = self._stepping.length(resumes_at)
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
         self._assemble(self.time, self.dt)
@@ -426,12 +454,14 @@ class Simulation:
         }
 
     def state(self) -> dict[str, State]:
-        """Return all that the next step reads: by field, closed regions, what accounts add to, and the stable step."""
+        """Return all that the next step reads, by field, and of clock, closed regions, accounts and stable step."""
         return {name: part() for name, part in self.keep().items()}
 
     def keep(self) -> dict[str, Callable[[], State]]:
         """Return what gives ``state`` of now, whatever steps are tried since. Collective, and so is each of it."""
         kept = {field.name: field.keep() for field in self.fields}
+        clock = zip(CLOCK, self._stepping.stored, strict=True)
+        kept["clock"] = held({name: scalar_slab(self.comm, value) for name, value in clock})
         if self.regions:
             kept["regions"] = self.regions.keep()
         if self.accounts.columns:
@@ -449,19 +479,36 @@ class Simulation:
         group : callable
             Returns the reader of a group of ``state`` by its name.
         """
-        self.forget()  # of the scene's start
         self.step, self.time, self.dt = step, time, dt
-        for field in self.fields:
-            field.restore(group(field.name))
-        if self.solid and self.watch:
-            self.watch.resume(self.solid)
-        for coupling in self.couplings:
-            coupling.restored()
-        if self.regions:
-            self.regions.restore(group("regions"))
+        length, begin, start = (float(group("clock")(name, (0,), (1,))[0]) for name in CLOCK)
+        self._stepping.go_on(step, time, (length, int(begin), start))
+        self.begin_with([field.name for field in self.fields], group)
         if self.accounts.columns:
             self.accounts.restore(group("accounts"))
         if self.accounts.columns:
             self.guard.restore(group("guard"))
         if self.stable.limited:
             self.stable.restore(group("stable"))
+
+    def begin_with(self, names: Collection[str], group: Callable[[str], Reader]) -> None:
+        """Take up the state of some fields of a checkpoint: after ``prepare`` all, before it others. Collective.
+
+        Parameters
+        ----------
+        names : collection of str
+            Of fields.
+        group : callable
+            Returns the reader of a group of ``state`` by its name.
+        """
+        whole = len(names) == len(self.fields)
+        if whole:
+            self.forget()  # of the scene's start
+        for field in self.fields:
+            if field.name in names:
+                field.restore(group(field.name))
+        if self.solid and self.watch:
+            self.watch.resume(self.solid)
+        for coupling in self.couplings:
+            coupling.restored()
+        if self.regions and whole:
+            self.regions.restore(group("regions"))

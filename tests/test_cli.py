@@ -83,18 +83,19 @@ def test_run_passes_everything_on(scene, calls):
     status = cli.main(
         ["run", str(scene), "--set", "time.dt=0.05", "-fsi_ksp_rtol", "1e-6", "--out", "somewhere", "-log_view"]
         + ["--steps=7", "-shift", "-1.5", "--overwrite", "--wall-limit", "60", "-options_file", "split.opts"]
-        + ["--set", "solids.sheet.young=2e5"]
+        + ["--set", "solids.sheet.young=2e5", "--from", "runs/old"]
     )
     assert status == 0
-    (loaded, out, steps, petsc, wall_limit, overwrite) = calls[0]
+    (loaded, out, steps, petsc, wall_limit, overwrite, sets, source) = calls[0]
     assert loaded.time.dt == 0.05 and loaded.solids["sheet"].young == 2e5
     assert (out, steps, wall_limit, overwrite) == (Path("somewhere"), 7, 60.0, True)
+    assert (sets, source) == (("time.dt=0.05", "solids.sheet.young=2e5"), Path("runs/old"))
     assert petsc == ["-fsi_ksp_rtol", "1e-6", "-log_view", "-shift", "-1.5", "-options_file", "split.opts"]
 
 
 def test_run_has_defaults(scene, calls):
     assert cli.main(["run", str(scene)]) == 0
-    assert calls[0][1:] == (Path("runs/sheet"), None, [], None, False)
+    assert calls[0][1:] == (Path("runs/sheet"), None, [], None, False, (), None)
 
 
 def test_resume_passes_everything_on(calls):

@@ -48,7 +48,9 @@ def test_one_holder_at_a_time(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"pid": os.getpid(), "started": 1}, {"pid": os.getpid(), "boot": "another start"}], ids=str
+    "changes",
+    [{}, {"pid": os.getpid(), "started": 1}, {"pid": os.getpid(), "boot": "another start"}],
+    ids=["no name", "another process", "another start"],
 )
 def test_what_a_dead_process_left_is_taken_over(tmp_path, changes):
     """Its number may be another's by now: then the two began at other times, or the machine did."""

@@ -143,7 +143,7 @@ def solves(case: Case, contestants: list[tuple[Scene, str]], repeats: int) -> li
 
 def _start(sim: Simulation) -> None:
     """Assemble the first step of a bar that exerts no force. Collective."""
-    sim.prepare(resumes=True)  # else most of the first solve would have been done at the start
+    sim.prepare(resumes_at=0.0)  # else most of the first solve would have been done at the start
     for field in sim.fields:
         field.predict(sim.time, sim.dt)
     for coupling in sim.couplings:

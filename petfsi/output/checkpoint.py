@@ -22,7 +22,7 @@ import numpy as np
 from mpi4py import MPI
 
 import petfsi
-from petfsi.errors import InputError, SolveError
+from petfsi.errors import InputError, NotStoredError, SolveError
 from petfsi.fields.base import Reader, Slab
 from petfsi.output import files, hdf5, stored_state
 from petfsi.output.manifest import FORMAT, MAX_BYTES, Manifest, Mark, Record, read_manifest
@@ -271,6 +271,17 @@ class CheckpointReader:
         """Return the names of the fields that have state here."""
         return sorted(self._file)
 
+    def unread(self) -> list[str]:
+        """Return the arrays that nothing has read, as ``group/array``, of whole groups the group. Not collective."""
+        read = {name.split("/")[0] for name in self._ends}
+        return sorted(
+            {
+                name if name.split("/")[0] in read else name.split("/")[0]
+                for name in self._shapes
+                if name not in self._ends
+            }
+        )
+
     def group(self, name: str) -> Reader:
         """Return the reader of one field's state.
 
@@ -288,7 +299,7 @@ class CheckpointReader:
 
     def _read(self, name: str, start: tuple[int, ...], count: tuple[int, ...]) -> np.ndarray:
         if name not in self._shapes:
-            raise InputError(f"checkpoint {self.path} has no array '{name}', which the scene asks for")
+            raise NotStoredError(f"checkpoint {self.path} has no array '{name}', which the scene asks for")
         dataset = self._file[name]
         if len(dataset.shape) != len(count):
             raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -39,24 +39,39 @@ class History:
     known : Rows, optional
         Of a run that goes on: the rows that its checkpoint counts. Those behind them are dropped. Without it the table
         is new.
+    spare : collection of str
+        Columns that come and go with what may change when a run goes on. It keeps those that its table began with.
+
+    Attributes
+    ----------
+    columns : list of str
+        Of the table.
 
     Raises
     ------
     InputError
-        When the known rows are not what they were, or have other columns.
+        When the known rows are not what they were, or have columns that differ by more than ``spare``.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str], comm: MPI.Comm, known: Rows | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        columns: Sequence[str],
+        comm: MPI.Comm,
+        known: Rows | None = None,
+        spare: Collection[str] = (),
+    ) -> None:
         self.path = Path(path)
         self.columns = list(columns)
         self.comm = comm
         if comm.rank == 0 and len(set(columns)) != len(self.columns):
             raise ValueError(f"a column stands twice in {columns}")
         self._table: Table | None = None
-        self._on_root(lambda: self._open(known))
+        self._on_root(lambda: self._open(known, spare))
+        self.columns = comm.bcast(self.columns)
 
     def append(self, row: Mapping[str, float]) -> None:
-        """Write a row and hand it to the system, so that it outlives the process. Collective.
+        """Write the columns of a row and hand it to the system, so that it outlives the process. Collective.
 
         Raises
         ------
@@ -89,20 +104,20 @@ class History:
             why = files.agreed_reason(self.comm, error)
             raise SolveError(f"{self.path} could not be written: {why}.{last}") from error
 
-    def _open(self, known: Rows | None) -> None:
-        header = ",".join(self.columns)
+    def _open(self, known: Rows | None, spare: Collection[str]) -> None:
         if known is None:
-            self._table = Table.begun(self.path, header)
+            self._table = Table.begun(self.path, ",".join(self.columns))
             return
         self._table, _behind = known_rows(self.path, known)
         with open(files.open_plain(self.path), encoding="utf-8", errors="replace") as file:
-            found = file.readline().rstrip("\n")
-        if found != header:
-            raise InputError(f"{self.path} has the columns {found.replace(',', ', ')}, not {', '.join(self.columns)}")
+            found = file.readline().rstrip("\n").split(",")
+        if [name for name in found if name not in spare] != [name for name in self.columns if name not in spare]:
+            raise InputError(f"{self.path} has the columns {', '.join(found)}, not {', '.join(self.columns)}")
+        self.columns = found
         self._table.cut()
 
     def _write(self, row: Mapping[str, float]) -> None:
-        if row.keys() != set(self.columns):
+        if not row.keys() >= set(self.columns):
             raise ValueError(f"a row of {self.path} has {sorted(row)} and should have {sorted(self.columns)}")
         assert self._table is not None
         self._table.append(",".join(str(int(row[c])) if c in WHOLE else repr(float(row[c])) for c in self.columns))

@@ -49,8 +49,29 @@ class MeshMark(Mark):
     source: str
 
 
+class Change(_Entry):
+    """A setting that another leg has another value of, as TOML, or one of PETSc's options, by ``-name``; None: none."""
+
+    key: str
+    old: str | None
+    new: str | None
+
+
+class OriginMark(_Entry):
+    """The checkpoint of another run that one began with."""
+
+    file: str
+    step: Count
+    time: Seconds
+    blake2b: Digest
+
+
 class Leg(_Entry):
-    """A part of a run by one process, with what it was told: ``--set`` and PETSc's options as given."""
+    """A part of a run by one process, with what it was told: ``--set`` and PETSc's options as given.
+
+    ``changes`` is how its settings differ from those that the checkpoint was written with, ``origin`` whose state a
+    first leg began with.
+    """
 
     step: Count
     time: Seconds
@@ -58,6 +79,8 @@ class Leg(_Entry):
     petfsi: str
     sets: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
+    origin: OriginMark | None = None
 
 
 class Record(_Entry):
@@ -68,6 +91,8 @@ class Record(_Entry):
     scene, options : tuple of str
         The digests that ``scene.toml`` and ``options.opts`` may have, the present one last: there are two while they
         are changed, so that a crash in between leaves a run that fits.
+    settings : dict of str to str
+        Those that may change when the run goes on, and PETSc's options, as they were when the checkpoint was written.
     meshes : tuple of MeshMark
     history : Rows or None
         Of ``history.csv``.
@@ -83,6 +108,7 @@ class Record(_Entry):
 
     scene: tuple[Digest, ...] = ()
     options: tuple[Digest, ...] = ()
+    settings: dict[str, str] = {}
     meshes: tuple[MeshMark, ...] = ()
     history: Rows | None = None
     outputs: Rows | None = None

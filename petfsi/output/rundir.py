@@ -21,6 +21,7 @@ from petfsi.output.lock import NAME as LOCK
 from petfsi.output.manifest import FORMAT, Leg, Record
 from petfsi.output.mesh_files import DIRECTORY, MeshFile, changed_meshes, copy_meshes
 from petfsi.ranks import on_root
+from petfsi.scene.changes import settings
 
 #: Marks a directory as a run: a scene and options alone may be somebody's own.
 MARKER = ".petfsi-run"
@@ -126,9 +127,10 @@ class RunDirectory:
 
     def first_record(self, meshes: Sequence[MeshFile], leg: Leg) -> Record:
         """Return what the first checkpoint says of a run that has just been made. Not collective."""
-        scene, options = (files.digest(path)[1] for path in (self.scene, self.options))
+        texts = [files.read_plain(path).decode() for path in (self.scene, self.options)]
+        scene, options = (files.digest_of(text.encode()) for text in texts)
         marks = tuple(mesh.mark for mesh in meshes)
-        return Record(scene=(scene,), options=(options,), meshes=marks, legs=(leg,))
+        return Record(scene=(scene,), options=(options,), settings=settings(*texts), meshes=marks, legs=(leg,))
 
     def misfits(self, known: Record) -> list[str]:
         """Return what of the run is not what a checkpoint of it vouches for, and what can be done. Not collective."""
@@ -172,7 +174,8 @@ class RunDirectory:
             files.replace_text(self.scene, scene_text)
             files.replace_text(self.options, options_text)
         legs = (*(old for old in known.legs if old.step <= leg.step), leg)
-        return known.model_copy(update={"scene": (scene,), "options": (options,), "legs": legs})
+        now = settings(scene_text, options_text)
+        return known.model_copy(update={"scene": (scene,), "options": (options,), "settings": now, "legs": legs})
 
     def _is_run(self) -> bool:
         return (self.path / MARKER).is_file()

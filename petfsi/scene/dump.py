@@ -28,7 +28,7 @@ def dump_scene(scene: Scene, meshes: Mapping[str, str] | None = None) -> str:
         if "mesh" in item["shape"]:
             item["shape"]["mesh"] = os.path.abspath(scene.directory / item["shape"]["mesh"])
     _rename(data, meshes or {})
-    _drop_idle(data)
+    drop_idle(data)
     return "\n".join(_table(data, ())).lstrip("\n") + "\n"
 
 
@@ -40,17 +40,17 @@ def _rename(data: Any, meshes: Mapping[str, str]) -> None:
         _rename(item, meshes)
 
 
-def _drop_idle(data: Any) -> None:
+def drop_idle(data: Any) -> None:
     """Leave out the mesh scale of shapes that are no mesh."""
     if isinstance(data, dict) and "scale" in data and "mesh" not in data:
         del data["scale"]
     for item in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
-        _drop_idle(item)
+        drop_idle(item)
 
 
 def _table(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
     """Return the lines of a table: its plain settings first, as TOML wants it, then the tables inside."""
-    lines = [f"{_key(name)} = {_value(value)}" for name, value in table.items() if not isinstance(value, dict)]
+    lines = [f"{_key(name)} = {as_toml(value)}" for name, value in table.items() if not isinstance(value, dict)]
     inner = [(name, value) for name, value in table.items() if isinstance(value, dict)]
     if path and lines:
         lines = ["", f"[{'.'.join(map(_key, path))}]", *lines]
@@ -67,15 +67,16 @@ def _text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _value(value: Any) -> str:
+def as_toml(value: Any) -> str:
+    """Return a value as it stands in a TOML file."""
     match value:
         case bool():
             return "true" if value else "false"
         case str():
             return _text(value)
         case list():
-            return "[" + ", ".join(map(_value, value)) + "]"
+            return "[" + ", ".join(map(as_toml, value)) + "]"
         case dict():
-            items = ", ".join(f"{_key(name)} = {_value(item)}" for name, item in value.items())
+            items = ", ".join(f"{_key(name)} = {as_toml(item)}" for name, item in value.items())
             return f"{{ {items} }}" if items else "{}"
     return repr(value)

@@ -13,15 +13,13 @@ from pydantic import ValidationError
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.scene import checks, mistakes
+from petfsi.scene.changes import is_under
 from petfsi.scene.dump import dump_scene
 from petfsi.scene.mistakes import Problem
 from petfsi.scene.raw import MAX_DEPTH, judge_raw, read_raw
 from petfsi.scene.schema import Scene
 
-__all__ = ["RESUMABLE", "apply_set", "dump_scene", "load_scene", "parse_value", "scene_from_dict"]
-
-#: What may be changed when a run is resumed: nothing that the state at hand depends on.
-RESUMABLE = ("time.end", "time.energy_limit", "output", "checkpoint")
+__all__ = ["apply_set", "dump_scene", "load_scene", "parse_value", "scene_from_dict"]
 
 #: Characters of a file's name, or a setting, that are shown.
 LONGEST = 200
@@ -39,7 +37,7 @@ def load_scene(path: Path | str, sets: Sequence[str] = (), only: Sequence[str] |
     sets : sequence of str
         Settings ``a.b.c=value`` that override the file.
     only : sequence of str, optional
-        The keys, or tables, that ``sets`` may change, such as ``RESUMABLE``; all by default.
+        The keys, or tables, that ``sets`` may change, ``RESUMABLE``; all by default.
 
     Raises
     ------
@@ -70,8 +68,11 @@ def apply_set(data: dict[str, Any], setting: str, only: Sequence[str] | None = N
     parts = key.split(".")
     if not separator or not all(parts):
         raise InputError(f"--set {setting}: must be key=value, such as --set time.dt=0.01")
-    if only is not None and not any(parts[: len(o.split("."))] == o.split(".") for o in only):
-        raise InputError(f"--set {setting}: here only {', '.join(only)} may be changed; for the rest start a new run")
+    if only is not None and not is_under(parts, only):
+        raise InputError(
+            f"--set {setting}: a run that goes on may change {', '.join(only)} and PETSc options; what "
+            "else may differ in a new run from this one's state: petfsi run NEW.toml --from DIR"
+        )
     holder: Any = data
     if len(parts) > MAX_DEPTH:
         raise InputError(f"--set {setting}: tables are nested no deeper than {MAX_DEPTH} levels")

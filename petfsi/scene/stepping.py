@@ -37,6 +37,35 @@ class Stepping:
         self._dt = Expression(UNKNOWN * time.end if self.auto else time.dt, ("t",), key="time.dt")
         self.constant = self._dt.is_constant and not self.auto
         self._length: float | None = None  # of all steps, once it is known
+        self._origin = 0, 0.0  # the step and time from which equal steps are counted
+
+    def go_on(self, step: int, t: float, stored: tuple[float, int, float]) -> None:
+        """Take up a run at a step and its time: its equal steps are counted on, others begin there.
+
+        Parameters
+        ----------
+        step : int
+        t : float
+        stored : tuple of float, int, float
+            What ``stored`` was then.
+
+        Raises
+        ------
+        ValueError
+            If that does not lead to t.
+        """
+        length, begin, start = stored
+        if not (self.constant and length == self.length(t)):
+            self._origin = step, t
+        elif abs(start + (step - begin) * length - t) <= SLACK * length:
+            self._origin = begin, start
+        else:
+            raise ValueError(f"its clock does not lead to t = {t:g} s in {step} steps")
+
+    @property
+    def stored(self) -> tuple[float, int, float]:
+        """The length of equal steps (s) and from which step and time (s) they are counted; zeros of other steps."""
+        return (self.length(self._origin[1]), *self._origin) if self.constant else (0.0, 0, 0.0)
 
     def length(self, t: float, stable: float | None = None) -> float:
         """Return the length of the step that begins at t, s.
@@ -77,23 +106,24 @@ class Stepping:
     def after(self, step: int, t: float, dt: float) -> float:
         """Return the time after a step of length dt that began at t and ends as number ``step``, s."""
         # a multiple has one rounding, a sum as many as terms
-        return step * dt if self.constant else t + dt
+        begin, start = self._origin
+        return start + (step - begin) * dt if self.constant else t + dt
 
     def finished(self, t: float, dt: float) -> bool:
         """Say whether t, reached by a step of length dt, is the end."""
         return t >= self.end - SLACK * dt
 
     def count(self, most: int) -> int | None:
-        """Return how many steps there are; None if they differ and are more than ``most``, or one is impossible."""
-        step, t = 0, 0.0
+        """Return the last step's number; None if they differ and are more than ``most``, or one is impossible."""
+        step, t = begin, start = self._origin
         if self.auto:
             return None
         try:
             dt = self.length(t)
             if self.constant:
-                return max(1, math.ceil(self.end / dt - SLACK))
-            while step == 0 or not self.finished(t, dt):
-                if step == most:
+                return begin + max(1, math.ceil((self.end - start) / dt - SLACK))
+            while step == begin or not self.finished(t, dt):
+                if step == begin + most:
                     return None
                 dt = self.length(t)
                 step, t = step + 1, self.after(step + 1, t, dt)
