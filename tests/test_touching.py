@@ -68,6 +68,32 @@ def test_edges_meet_where_no_corner_does():
     assert found.part == pytest.approx(0.25, abs=1e-12)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-10, 1e-8])
+def test_edges_that_stay_parallel_but_for_round_off_meet_nothing_far_away(noise):
+    """Triangles that come near each other, straight, an edge of the one parallel to one of the other."""
+    rng, facet = np.random.default_rng(1), np.array([[0, 1, 2]])
+    for _ in range(500):
+        along = rng.normal(0.0, 1.0, 3) * [1.0, 0.0, 1.0]
+        still = np.array([[0.0, 0.0, 0.0], along, rng.uniform(-1.0, 1.0, 3) * [1.0, 0.0, 1.0]])
+        over = [rng.uniform(-0.5, 0.5), 2.0, rng.uniform(-0.5, 0.5)]
+        body = np.array([[0.0, 0.0, 0.0], rng.uniform(0.1, 0.9) * along, rng.uniform(-1.0, 1.0, 3)]) + over
+        ways = [Way(x, x + d + rng.normal(0.0, noise, x.shape), facet) for x, d in ((body, [0, -0.5, 0]), (still, 0.0))]
+        assert first_meeting(*ways) is None
+
+
+def test_round_off_that_turns_an_edge_by_less_than_itself_meets_nothing():
+    """Of a ball thrown at a box: an edge level with a diagonal, .36 above it, and a solver's round-off in the ways."""
+    body = np.array([[0.5, 1.401, 0.5], [0.5, 1.4007071067811867, 0.5992928932188135],
+                     [0.4007071067811866, 1.4007071067811867, 0.5]])  # fmt: skip
+    way = np.array([[7.7838080425607359e-08, -0.49999944935898866, 7.7701605483149194e-08],
+                    [-5.3403902966486783e-09, -0.49999936782532850, -2.4931681275042195e-07],
+                    [1.0218764695535398e-07, -0.49999965657219769, 1.9069120937853512e-07]])  # fmt: skip
+    box = np.array([[0.3, 1.037, 0.3], [0.7, 1.037, 0.3], [0.7, 1.037, 0.7]])
+    facet = np.array([[0, 1, 2]])
+    found = first_meeting(Way(body, body + way, facet), Way(box, box, facet))
+    assert found.part == pytest.approx((1.401 - 1.037) / 0.5, abs=1e-5)
+
+
 def test_a_small_thing_that_ends_wholly_inside_has_crossed():
     small = SQUARE[0] * 1e-3 + [0.5, 3.0]
     found = first_meeting(Way(small, small - [0.0, 2.5], SQUARE[1]), Way(SQUARE[0], SQUARE[0], SQUARE[1]))

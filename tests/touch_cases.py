@@ -108,7 +108,7 @@ def run_scene(kind, thing, how, speed, wet):
     gap = min(3.7 * speed * cell, 0.313)
     v, axes = speed * cell / DT, ["x", "y", "z"][:dim]
     held = [{"where": "all", "fix": [*axes, *(["angle"] if "beam" in kind else [])], "velocity": {"y": -v}}]
-    down = {"supports": held} if how == "held" else {"initial": {"velocity": [0.0, -v, 0.0][:dim]}, "density": 1e5}
+    down = {"supports": held} if how == "held" else {"initial": {"velocity": [0.0, -v, 0.0][:dim]}, "density": 1e7}
     top = 0.4 - gap if thing != "image" else 0.4 - gap + 1.0
     thick = min(0.05, 0.8 * (0.4 - gap)) if thing != "plate" else 0.04 * cell
     shape = box([0.3, top - thick, 0.3][:dim], [0.4, thick, 0.4][:dim])

@@ -19,8 +19,11 @@ from numba import njit
 
 #: What is beyond the end of an edge by this part of it counts: points must not pass between neighbouring facets.
 BEYOND = 1e-9
-#: Edges whose sine is less meet in their ends.
-PARALLEL = 1e-10
+#: Edges whose sine is less meet in their ends; the square of a lesser one is round-off of lengths.
+PARALLEL = 1e-7
+#: What is farther apart than this part of all lengths does not meet: of points that stay in one plane (line), the cubic
+#: is round-off, and so are its roots.
+APART = 1e-6
 #: So many bisections leave no more than round-off.
 BISECTIONS = 52
 #: Corners, in a pair of triangles, of a point and a triangle, and of two edges.
@@ -280,17 +283,34 @@ def _meet(x, corners):
     if len(corners) == 3:
         p, a, b = corners[0], corners[1], corners[2]
         along, length2 = _dot(x, p, a, b, a), _dot(x, b, a, b, a)
-        return -BEYOND * length2 <= along <= (1.0 + BEYOND) * length2
+        if not -BEYOND * length2 <= along <= (1.0 + BEYOND) * length2 or length2 == 0.0:
+            return False
+        return _touch(x, p, p, 0.0, a, b, along / length2, b, 0.0)
     if _are_edges(corners):
+        p, q, a, b = corners[0], corners[1], corners[2], corners[3]
         s, t = _edge_weights(x, corners)
-        return -BEYOND <= s <= 1.0 + BEYOND and -BEYOND <= t <= 1.0 + BEYOND
+        if not (-BEYOND <= s <= 1.0 + BEYOND and -BEYOND <= t <= 1.0 + BEYOND):
+            return False
+        return _touch(x, p, q, s, a, b, t, b, 0.0)
     p, a, b, c = corners[0], corners[1], corners[2], corners[3]
     ee, eg, gg = _dot(x, b, a, b, a), _dot(x, b, a, c, a), _dot(x, c, a, c, a)
     re, rg = _dot(x, p, a, b, a), _dot(x, p, a, c, a)
     det = ee * gg - eg * eg
     s, t = gg * re - eg * rg, ee * rg - eg * re
-    return det > 0.0 and s >= -BEYOND * det and t >= -BEYOND * det and s + t <= (1.0 + BEYOND) * det
+    if not (det > 0.0 and s >= -BEYOND * det and t >= -BEYOND * det and s + t <= (1.0 + BEYOND) * det):
+        return False
+    return _touch(x, p, p, 0.0, a, b, s / det, c, t / det)
 
+
+@njit(cache=True)
+def _touch(x, p, q, s, a, b, t, c, u):
+    """Whether p + s (q - p) is as good as a + t (b - a) + u (c - a)."""
+    gap = size = 0.0
+    for k in range(x.shape[1]):
+        pq, ab, ac, pa = x[q, k] - x[p, k], x[b, k] - x[a, k], x[c, k] - x[a, k], x[p, k] - x[a, k]
+        gap += (pa + s * pq - t * ab - u * ac) ** 2
+        size += pa**2 + pq**2 + ab**2 + ac**2
+    return gap <= APART**2 * size
 
 @njit(cache=True)
 def _edge_weights(x, corners):
