@@ -112,7 +112,7 @@ def replaced(old, new):
 
 SCENES = {
     "no TOML": ("dim = = 2", ["not valid TOML", "line 1"]),
-    "not text": (b"\xff\xfe\x00", ["is not UTF-8 text"]),
+    "not text": (b"\xff\xfe\x01", ["is not UTF-8 text"]),
     "empty": ("", ["dim: is missing", "time: is missing"]),
     "missing key": (replaced("density = 20.0\n", ""), ["solids.block.density: is missing", "kg/m^3"]),
     "missing table": (replaced("[time]\nend = 0.5\ndt = 0.05\n", ""), ["time: is missing"]),
@@ -402,7 +402,7 @@ def test_a_state_that_blows_up_ends_the_run_and_names_the_checkpoint(tmp_path, r
     "setting, said",
     [
         (
-            "fluid.initial.velocity=[1e9, 0.0]",
+            "fluid.initial.velocity=[5e4, 0.0]",
             ["step 1, t = 0.05 s: the flow has blown up", "in one step of 0.00625 s"],
         ),
         ('gravity=["log(0.2-t)", 0.0]', ["t = 0.2 s: gravity", "it must be finite"]),
@@ -422,19 +422,19 @@ def test_what_goes_wrong_only_later_is_a_failed_step(scene, here, setting, said)
 
 #: What numbers cannot hold, where NumPy would warn before anyone judges: settings, exit code, what is said.
 BEYOND_NUMBERS = {
-    "speed": (["solids.block.initial.velocity=[1e200, 0.0]"], 3, "look at loads, supports, speeds"),
-    "inflow": (["fluid.sides.left.inflow.speed=1e200"], 3, "the flow has blown up: it would cross"),
-    "gravity": (["gravity=[0.0, -1e300]"], 3, "look at loads, supports, speeds"),
+    "speed": (['solids.block.initial.velocity=["1e200*x", 0.0]'], 3, "look at loads, supports, speeds"),
+    "inflow": (['fluid.sides.left.inflow.speed="1e200*t"'], 3, "the flow has blown up: it would cross"),
+    "gravity": (['gravity=[0.0, "-1e300*t"]'], 3, "look at loads, supports, speeds"),
     "support": (['solids.block.supports.0.displacement={ x = "1e300*t" }'], 3, "look at loads, supports, speeds"),
     "damping": (
         ["solids.block.damping={ mass = 1e300, stiffness = 1e300 }", 'solids.block.initial.velocity=["y", 0.0]'],
-        3,
-        "densities, damping, and the sizes",
+        2,
+        "solids.block.damping.mass = 1e+300: must be at most 1e+30 in size",
     ),
     "size": (
         ["fluid.size=[3e200, 2e200]", "solids.block.shape.box.size=[1e200, 1e200]", "probes={}"],
         2,
-        "petfsi: a node or cell of inf kg is too light or too heavy; look at densities, and at the sizes of cells\n",
+        "fluid.size.0 = 3e+200: must be at most 1e+15 in size",
     ),
 }
 
@@ -447,7 +447,7 @@ def test_what_overflows_is_told_of_once_by_those_who_judge(scene, here, name):
     done = here("run", scene, "--out", "out", *words)
     is_clear(done, said)
     assert done.returncode == code
-    assert here("check", scene, *words).returncode in (0, 2)
+    assert here("check", scene, *words).returncode in (0, code)
 
 
 @pytest.mark.parametrize(
@@ -475,7 +475,7 @@ def test_what_has_no_value_in_the_first_step_is_a_mistake(scene, here, setting, 
 @pytest.mark.parametrize(
     "where, limit, sets, ranks",
     [
-        ("history.csv", 1500, [], 1),
+        ("history.csv", 5000, [], 1),
         ("fields/", 9000, ["--set", "output.every=0.05"], 1),
         ("checkpoint/000002.h5", 9000, ["--set", "checkpoint.every=0.1"], 1),
         ("checkpoint/000002.h5", 9000, ["--set", "checkpoint.every=0.1"], 2),
@@ -483,7 +483,7 @@ def test_what_has_no_value_in_the_first_step_is_a_mistake(scene, here, setting, 
     ids=["history", "fields", "checkpoint", "two ranks"],
 )
 def test_a_full_disk_is_a_failure(scene, where, limit, sets, ranks):
-    sets = [*sets, "--set", "time.dt=0.0125"] if where == "history.csv" else sets
+    sets = [*sets, "--set", "time.dt=0.004"] if where == "history.csv" else sets
     done = petfsi("run", scene, "--out", "out", *sets, ranks=ranks, file_limit=limit)
     has_failed(done, "out", f"out/{where}", "could not be written: File too large")
     history = Path("out/history.csv").read_text()
@@ -587,7 +587,7 @@ def test_what_cannot_be_resumed_is_refused(run, here, tmp_path):
         run,
         "--set",
         "fluid.density=3",
-        said="only time.end, time.energy_limit, output, checkpoint may be changed",
+        said="--set fluid.density=3: a run that goes on may change time.end, time.dt, ",
     )
     refused("resume", run, "--set", "time.end=-1", said="time.end = -1: must be greater than 0")
     refused("run", run / "scene.toml", "--out", run, said="holds a run already; continue it with 'petfsi resume")
@@ -681,7 +681,7 @@ def test_a_log_of_mpirun_has_no_escape_codes(scene):
     slowly = ["--set", "fluid.sides.left.inflow.ramp=0.2"]
     done = petfsi("run", scene, "--out", "out", "--steps", 2, *slowly, ranks=2)
     assert done.returncode == 0 and "\x1b" not in done.stdout
-    assert [line[:6] for line in done.stdout.splitlines()[1:]] == ["step 1", "step 2"]
+    assert [line[:6] for line in done.stdout.splitlines()[1:]] == ["step 1", "step 2", "stoppe"]
 
 
 def test_a_reader_who_leaves_does_not_end_the_run(scene):
