@@ -11,6 +11,8 @@ import pytest
 from processes import environment, launcher
 
 from petfsi import cli
+from petfsi.output import files
+from petfsi.output.checkpoint import change_records
 
 SCENE = Path(__file__).parent / "scenes" / "sweep.toml"
 PRESSURE = "-fsi_fieldsplit_pressure_"
@@ -91,6 +93,9 @@ def test_a_crafted_run_directory_neither_runs_code_nor_writes(line, run, tmp_pat
     assert run()[0] == 0
     options = Path("out/options.opts")
     options.write_text(options.read_text() + line + "\n")
+    assert "options.opts has been changed since the checkpoint was written" in run(command=("resume",))[1]
+    crafted = files.digest(options)[1]
+    change_records(Path("out/checkpoint"), lambda known: known.model_copy(update={"options": (crafted,)}))
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
     code, said = run(command=("resume",))
     assert code == 2 and re.search(r"(options|evil)\.opts, line \d+: ", said), said
