@@ -312,6 +312,7 @@ def _touch(x, p, q, s, a, b, t, c, u):
         size += pa**2 + pq**2 + ab**2 + ac**2
     return gap <= APART**2 * size
 
+
 @njit(cache=True)
 def _edge_weights(x, corners):
     """Return where on the lines of two edges they are nearest, 0 to 1 on the edges; beyond if they are parallel."""
