@@ -8,6 +8,7 @@ from mpi4py import MPI
 from petfsi.accounts import Accounts
 from petfsi.errors import SolveError
 from petfsi.fields.base import Reader, Slab, scalar_slab
+from petfsi.fields.stored import EXACT
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
@@ -98,6 +99,8 @@ class EnergyGuard:
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
         self.weight, beyond = (float(read(name, (0,), (1,))[0]) for name in ("weight", "beyond"))
+        if not (self.weight >= 0 and 0 <= beyond <= EXACT):  # every rank has read the same
+            raise ValueError(f"'weight' or 'beyond' of the guard are {self.weight:g} and {beyond:g}")
         self.beyond = int(beyond)
 
 

@@ -117,7 +117,8 @@ class Origin:
             group = stored.group if goes_on else _without_past(stored.group)
             if whole:
                 unread = simulation.prepare(resumes_at=0.0)
-                simulation.begin_with(taken, group)
+                with checkpoints.taken_up(self.found):
+                    simulation.begin_with(taken, group)
                 simulation.rehearse(resumes_at=0.0)  # books are opened, and solutions looked for, where bodies are now
                 simulation.accounts.start()
                 simulation.begin_with(taken, group)  # that has moved the fluid's faces to them
@@ -125,7 +126,8 @@ class Origin:
                     simulation.regions.go_on()
                 simulation.check_step()
             else:
-                simulation.begin_with(taken, group)
+                with checkpoints.taken_up(self.found):
+                    simulation.begin_with(taken, group)
                 unread = simulation.prepare()
             unused = [name for name in stored.unread() if name.split("/")[0] not in _OWN]
         simulation.notes[:0] = self._notes(simulation, taken, unused, goes_on)

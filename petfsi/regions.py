@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.fields.base import PressureFluid, Reader, Slab, SolidField, State
+from petfsi.fields.stored import outside, refuse
 from petfsi.lasting import TABLES, Tracked, bounded_most, looked_up, meeting, pairs
 from petfsi.system import System
 
@@ -30,6 +31,8 @@ JUMP, SMALL = 0.05, 0.01
 #: Where sources swing, the next volume wanted lags behind their change by a quarter of this: they then shrink by .61
 #: a step, which is nearly the fastest.
 DAMPING = 0.15
+#: The largest number of a lasting region; there are tables as long.
+_MOST = 10_000_000
 
 
 class ClosedRegions:
@@ -459,6 +462,8 @@ class ClosedRegions:
             np.concatenate(comm.allgather(np.asarray(read(f"facet_{name}", (begin,), (end - begin,)), dtype=float)))
             for name in ("region", *TABLES)
         )
+        names = zip(("region", "facet_region"), (number, facets), strict=True)
+        refuse(comm, [outside(name, values, 0, _MOST, whole=True) for name, values in names])
         tables: tuple[dict[int, float], ...] = ({}, {}, {}, {}, {})
         for labels, values in ((number, by_cell), (facets, by_facet)):
             rows, first = np.unique(labels, return_index=True)

@@ -132,12 +132,8 @@ def resume_run(
 
 def _restore(simulation: Simulation, found: checkpoints.CheckpointInfo) -> None:
     """Take up the state of a checkpoint. Collective; InputError on all ranks if it is not one of the scene's."""
-    with checkpoints.read_checkpoint(found, simulation.comm) as stored:
-        try:
-            simulation.restore(stored.step, stored.time, stored.dt, stored.group)
-        except (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError) as error:
-            what = " ".join(str(error).split())[:200]
-            raise InputError(f"checkpoint {found.path} holds no state of this scene: {what}") from error
+    with checkpoints.read_checkpoint(found, simulation.comm) as stored, checkpoints.taken_up(found):
+        simulation.restore(stored.step, stored.time, stored.dt, stored.group)
 
 
 def _leg(

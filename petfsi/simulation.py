@@ -16,6 +16,7 @@ from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
 from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
+from petfsi.fields.solid.field import FAR
 from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
@@ -42,9 +43,6 @@ START_NOTED = 1e-3
 #: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
 #: is left.
 REPEATS = 6
-
-#: How far from the origin solids may begin, over their extent: round-off leaves seven digits of it.
-FAR = 1e9
 
 
 class Simulation:

@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Field, Reader, Slab, SolidField, scalar_slab
+from petfsi.fields.stored import EXACT
 from petfsi.scene.schema import Time
 
 #: The stable step is found anew after so many steps at most,
@@ -132,4 +133,7 @@ class StableStep:
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
         limit, steps, way, stretch = (float(read(name, (0,), (1,))[0]) for name in ("limit", "steps", "way", "stretch"))
+        for name, value in (("limit", limit), ("steps", steps), ("way", way), ("stretch", stretch)):
+            if not 0 <= value <= (EXACT if name == "steps" else math.inf):  # every rank has read the same
+                raise ValueError(f"'{name}' of the stable step is {value:g}")
         self.limit, self._steps, self._way, self._stretch = limit, int(steps), way, stretch

@@ -14,6 +14,7 @@ from petfsi.couplings.enclosure import Enclosure
 from petfsi.couplings.walls import WallCoupling
 from petfsi.fields.base import Forces, SolidField, Work
 from petfsi.fields.mac.slivers import outer_products
+from petfsi.fields.stored import outside, refuse
 from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_sums, gather_triplets, sum_csr
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Cells that sheets may go from one cut to the next, see ``fields.mac.lineage``.
 STRIDE = 0.45
+#: A surface goes less than the grid's size in a step; where a file has it so much farther away, it is another's.
+_AWAY = 10.0
 
 
 class CutCellCoupling(WallCoupling):
@@ -105,6 +108,16 @@ class CutCellCoupling(WallCoupling):
             self._weight = self._rest_force(wet)
         self._stale = True
         self.n_coupled += 1
+
+    def restored(self) -> None:
+        """Look whether the grid was cut near where the surface is: it is followed from there. Collective."""
+        begin, here = self.fluid.cut_at, self.solid.surface_present()
+        if begin.shape == here.shape:
+            way = np.abs(begin - here).max(axis=1, initial=0.0)
+            refuse(
+                self.fluid.comm,
+                [outside("the way of the surface since cut_at", way, 0.0, _AWAY * float(max(self.fluid.grid.size)))],
+            )
 
     def _stations(self, positions: np.ndarray) -> list[np.ndarray]:
         """Return where to cut the grid on the way to some positions, them last: sheets must not pass by cells unseen.

@@ -11,8 +11,8 @@ import errno
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -329,6 +329,22 @@ class CheckpointReader:
             wanted = tuple(max(along) for along in zip(*ends, strict=True))
             if ends and wanted != shape:
                 raise InputError(f"checkpoint {self.path}: '{name}' has shape {shape}; the scene wants {wanted}")
+
+
+@contextmanager
+def taken_up(info: CheckpointInfo) -> Iterator[None]:
+    """Name the checkpoint in which something is found inside ``with`` that can be no state of the scene.
+
+    Raises
+    ------
+    InputError
+        On the ranks, all or some, where that is found.
+    """
+    try:
+        yield
+    except (ValueError, IndexError, KeyError, TypeError, ArithmeticError, MemoryError) as error:
+        what = " ".join(str(error).split())[:200]
+        raise InputError(f"checkpoint {info.path} holds no state of this scene: {what}") from error
 
 
 def read_checkpoint(info: CheckpointInfo, comm: MPI.Comm) -> CheckpointReader:

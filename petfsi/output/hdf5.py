@@ -191,6 +191,34 @@ def _naming(path: Path) -> Iterator[None]:
         raise
 
 
+def lies_here(group: h5py.Group, name: str) -> bool:
+    """Return whether what has a name in a group is in the same file, and under this name: no link to elsewhere."""
+    return type(group.get(name, getlink=True)) is h5py.HardLink
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[h5py.File]:
+    """Open a file of the output on this rank alone; OSError where it, or something in it, is a link to elsewhere."""
+    os.close(files.open_plain(path))
+    with h5py.File(path, "r") as file:
+        for name in file:
+            _refuse_links(file, name, path)
+            for array in file[name] if isinstance(file[name], h5py.Group) else ():
+                _refuse_links(file[name], array, path)
+        yield file
+
+
+def _refuse_links(group: h5py.Group, name: str, path: Path) -> None:
+    """Raise OSError if what has a name in a group is not in the file itself."""
+    if lies_here(group, name):
+        found = group[name]
+        if not isinstance(found, h5py.Dataset) or found.id.get_create_plist().get_external_count() == 0:
+            return
+    raise OSError(
+        errno.ELOOP, f"'{group.name.strip('/')}/{name}' of it lies elsewhere, and links are not followed", str(path)
+    )
+
+
 def open_file(path: Path, mode: str, comm: MPI.Comm) -> h5py.File:
     """Open a file on all ranks together. Collective."""
     if comm.size == 1:

@@ -11,10 +11,13 @@ import h5py
 import numpy as np
 
 from petfsi.output import files
+from petfsi.output.hdf5 import lies_here
 from petfsi.output.manifest import Manifest
 
 #: Groups that may hold what is not finite: a stable step that nothing limits, the volume of a region that was opened.
 _BOOKS = ("stable", "accounts", "regions")
+#: Numbers of fields are smaller.
+LARGEST = 1e100
 #: Numbers that are looked at in one go.
 _CHUNK = 1 << 22
 _KINDS = ("float64", "float32", "int64", "int32", "uint8", "int8", "uint16", "int16", "uint32", "uint64", "bool")
@@ -23,7 +26,8 @@ _KINDS = ("float64", "float32", "int64", "int32", "uint8", "int8", "uint16", "in
 def fault(path: Path, manifest: Manifest) -> str:
     """Return in words why a checkpoint's data cannot be petfsi's; nothing if they can. Not collective.
 
-    Arrays lie in the file itself, plainly, in groups of one level, and numbers of fields are finite. Reads them all.
+    Arrays lie in the file itself, plainly, in groups of one level; numbers of fields are finite and not absurd. Reads
+    them all.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -49,20 +53,16 @@ def _about(file: h5py.File, manifest: Manifest) -> str:
 def _faults(file: h5py.File) -> Iterator[str]:
     left = file.id.get_filesize()
     for group in file:
-        if not _lies_here(file, group) or not isinstance(file[group], h5py.Group):
+        if not lies_here(file, group) or not isinstance(file[group], h5py.Group):
             yield f"'{group}' is no group of it"
             continue
         for name in file[group]:
             path = f"{group}/{name}"
-            if not _lies_here(file[group], name) or not isinstance(file[path], h5py.Dataset):
+            if not lies_here(file[group], name) or not isinstance(file[path], h5py.Dataset):
                 yield f"'{path}' is no array of it"
                 continue
             yield _layout_fault(file[path], path, left) or _value_fault(file[path], path)
             left -= file[path].id.get_storage_size()
-
-
-def _lies_here(group: h5py.Group, name: str) -> bool:
-    return type(group.get(name, getlink=True)) is h5py.HardLink
 
 
 def _layout_fault(array: h5py.Dataset, path: str, left: int) -> str:
@@ -86,6 +86,9 @@ def _value_fault(array: h5py.Dataset, path: str) -> str:
         return ""
     rows = max(1, _CHUNK // max(1, math.prod(array.shape[1:])))
     for begin in range(0, array.shape[0], rows):
-        if not np.isfinite(array[begin : begin + rows]).all():
+        values = array[begin : begin + rows]
+        if not np.isfinite(values).all():
             return f"'{path}' holds what is not finite"
+        if values.size and np.abs(values).max() > LARGEST:
+            return f"'{path}' holds {values.flat[np.abs(values).argmax()]:.3g}, which is no quantity of a scene"
     return ""

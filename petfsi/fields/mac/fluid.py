@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from petfsi.fields.mac.sides import wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
 from petfsi.fields.replicated import read_whole, whole_slab
+from petfsi.fields.stored import outside, refuse
 from petfsi.ranks import agreed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression, evaluate_at
@@ -629,10 +631,12 @@ class MacFluid(CoveredGrid):
 
     def _restore_parts(self, read: Reader) -> None:
         """Take back divided cells and faces, and what is on them; kinds are back already. Collective."""
-        self.sheets = self._sheets_of(Parts.restored(read))
+        table = Parts.restored(self.grid, read)
+        self.sheets = self._sheets_of(table)
         self._transport.advection.sheets = self.sheets
-        stored = {name: read_whole(read, f"parts_{name}") for name in self._on_parts()}
-        self.cut_at = read_whole(read, "cut_at").reshape(-1, self.dim)
+        of_pieces = {"smoke_pieces": 0 if self.smoke is None else len(table.cell)}
+        stored = {name: read_whole(read, f"parts_{name}", of_pieces.get(name, len(table))) for name in self._on_parts()}
+        self.cut_at = read_whole(read, "cut_at", self.cut_at.size).reshape(-1, self.dim)
         self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
         self._transport.carried.parts = self.velocity.parts
         for name, parts in stored.items():
@@ -647,6 +651,7 @@ class MacFluid(CoveredGrid):
             self.grid.halo.exchange(array, axis)
         if transport.past:
             transport.past_dt = float(read("past_dt", (0,), (1,))[0])
+        refuse(self.comm, self._kind_faults(transport.past_dt if transport.past else 0.0))
         for arrays in (self.velocity, transport.carried, *transport.past.values()):
             for axis in self._axes:
                 self.grid.fill_sides(arrays[axis], axis)
@@ -658,6 +663,13 @@ class MacFluid(CoveredGrid):
             self.forget()
         if self.smoke is not None:
             self._complete_cells(self.smoke)
+
+    def _kind_faults(self, past_dt: float) -> Iterator[str]:
+        """Yield what cannot be of kinds that a file holds: obstacles and sides are the scene's."""
+        yield outside("past_dt", np.array(past_dt), 0.0, np.inf)
+        yield outside("cell_kind", self.cell_kind[self.grid.owned(None)], kinds.FLUID, kinds.OUTSIDE)
+        for kind, letter, axis in zip(self.face_kind, "xyz", self._axes, strict=False):
+            yield outside(f"face_kind_{letter}", kind[self.grid.owned(axis)], kinds.DEAD, kinds.SPLIT)
 
     def _stored_reach(self) -> list[tuple[str, np.ndarray, int | None]]:
         """Return what the transport reads in place of the velocity, and the faces where the two differ."""

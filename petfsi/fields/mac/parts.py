@@ -7,6 +7,8 @@ There are as many of them as the sheets are large, not the grid: every rank know
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import product
@@ -16,6 +18,7 @@ import numpy as np
 from petfsi.fields.base import Reader, Slab
 from petfsi.fields.mac.grid import MacGrid
 from petfsi.fields.replicated import read_whole, whole_slab
+from petfsi.fields.stored import EXACT, outside
 
 
 @dataclass(frozen=True)
@@ -113,14 +116,77 @@ class Parts:
         return {f"parts_{f.name}": whole_slab(rank, getattr(self, f.name)) for f in fields(self)}
 
     @classmethod
-    def restored(cls, read: Reader) -> Parts:
-        """Return the table that ``state`` stored. Collective."""
-        columns = [(f.name, read_whole(read, f"parts_{f.name}")) for f in fields(cls)]
-        return cls(*(column if name in REAL else column.astype(np.int64) for name, column in columns))
+    def restored(cls, grid: MacGrid, read: Reader) -> Parts:
+        """Return the table that ``state`` stored. Collective; ValueError if it cannot be one of the grid's."""
+        columns: dict[str, np.ndarray] = {}
+        for f in fields(cls):
+            first = next(name for names in TABLES for name in names if f.name in names)
+            columns[f.name] = read_whole(read, f"parts_{f.name}", len(columns[first]) if first in columns else None)
+        if wrong := next(filter(None, _faults(grid, columns)), ""):
+            raise ValueError(wrong)  # every rank has read the same
+        return cls(*(column if name in REAL else column.astype(np.int64) for name, column in columns.items()))
 
 
 #: Columns of ``Parts`` that are no integers.
 REAL = ("volume", "openness", "wall_area")
+#: Columns of equal length.
+TABLES = (
+    ("cell", "piece", "volume"),
+    ("axis", "face", "below", "above", "openness"),
+    ("wall_cell", "wall_piece", "wall_facet", "wall_area"),
+)
+#: Pieces of a cell, more than any surface makes.
+_MOST = 1 << 20
+#: Fractions are so exact.
+_SLACK = 1e-6
+
+
+def _faults(grid: MacGrid, columns: dict[str, np.ndarray]) -> Iterator[str]:
+    """Yield what is wrong with a table that a file holds: each entry may be used as an index."""
+    n_cells, n_faces = math.prod(grid.cells), max(math.prod(_whole(grid, a)) for a in range(grid.dim))
+    ranges = {
+        "cell": (0, n_cells - 1), "piece": (1, _MOST), "axis": (0, grid.dim - 1), "face": (0, n_faces - 1),
+        "below": (-1, _MOST), "above": (-1, _MOST), "wall_cell": (0, n_cells - 1), "wall_piece": (0, _MOST),
+        "wall_facet": (0, EXACT),
+    }  # fmt: skip
+    for name, (low, high) in ranges.items():
+        yield outside(f"parts_{name}", columns[name], low, high, whole=True)
+    for name, high in (("volume", 1.0), ("openness", 1.0), ("wall_area", np.inf)):
+        yield outside(f"parts_{name}", columns[name], -_SLACK, high * (1.0 + _SLACK))
+    of_axis = np.array([math.prod(_whole(grid, a)) for a in range(grid.dim)])[columns["axis"].astype(int)]
+    yield outside("parts_face", columns["face"] - of_axis, -EXACT, -1)
+    for names in (("cell", "piece"), ("axis", "face", "below", "above")):
+        if not _ascends([columns[name] for name in names]):
+            yield f"the rows of {', '.join(f'parts_{name}' for name in names)} do not ascend, or one is there twice"
+    if np.any(np.diff(columns["wall_cell"]) < 0):
+        yield "'parts_wall_cell' does not ascend"
+    yield from _piece_faults(grid, columns)
+
+
+def _ascends(keys: list[np.ndarray]) -> bool:
+    """Return whether rows are in the order of their keys, each there once."""
+    after = np.zeros(max(len(keys[0]) - 1, 0), dtype=bool)
+    for key in reversed(keys):
+        step = np.diff(key)
+        after = (step > 0) | ((step == 0) & after)
+    return bool(after.all())
+
+
+def _piece_faults(grid: MacGrid, columns: dict[str, np.ndarray]) -> Iterator[str]:
+    """Yield what is wrong with pieces: those of a cell are counted from 1, and links and walls know no others."""
+    whole = {name: column if name in REAL else column.astype(np.int64) for name, column in columns.items()}
+    parts = Parts(**whole)
+    new = np.diff(parts.cell, prepend=-1) > 0
+    begin = np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))
+    yield outside("parts_piece", parts.piece - (np.arange(len(new)) - begin), 1, 1)
+    beside = ((cells_beside(grid, parts, True), parts.below), (cells_beside(grid, parts, False), parts.above))
+    walls = (parts.wall_cell, parts.wall_piece)
+    for name, (cell, piece) in zip(("below", "above", "wall_piece"), (*beside, walls), strict=True):
+        if np.any((cell < 0) != (piece < 0)):
+            yield f"'parts_{name}' has pieces beyond a side, or none within"
+        further = piece > 0
+        if np.any(_find((parts.cell, parts.piece), (cell[further], piece[further])) < 0):
+            yield f"'parts_{name}' names pieces that 'parts_piece' does not have"
 
 
 def _find(table: tuple[np.ndarray, ...], wanted: tuple[np.ndarray, ...]) -> np.ndarray:

@@ -25,6 +25,7 @@ from petfsi.fields.solid.shrinkage import Shrinkage
 from petfsi.fields.solid.spectrum import largest_eigenvalue
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.fields.solid.turning import Turning, bodies_of
+from petfsi.fields.stored import outside, refuse
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
 from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, relinearised, stable_step
@@ -34,6 +35,9 @@ from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Number
+
+#: How far from the origin solids may begin, and go, over their extent: round-off leaves seven digits of it.
+FAR = 1e9
 
 #: The least mass that rows can be measured against, kg; of the greatest the inverse.
 LIGHTEST = 1e-150
@@ -654,10 +658,15 @@ class NodalSolid(SolidField):
 
         self.displacement, self.velocity = nodes("displacement"), nodes("velocity")
         self._past = tuple(nodes(name) for name in self._integrator.past)
+        places = {"displacement": self.displacement}
+        places |= {n: x for n, x in zip(self._integrator.past, self._past, strict=True) if n.startswith("displacement")}
         if self._past:
             self._past_dt = float(read("past_dt", (0,), (1,))[0])
         if self._lumped is not None:
-            self._measured = nodes("displacement_measured")
+            self._measured = places["displacement_measured"] = nodes("displacement_measured")
+        most = FAR * self.extent
+        faults = [outside(name, x[:, : self.dim], -most, most) for name, x in places.items()]
+        refuse(self.comm, [*faults, outside("past_dt", np.array(self._past_dt), 0.0, np.inf)])
         self._stage = self._geometry = None
 
     def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:

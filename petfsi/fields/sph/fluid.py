@@ -34,11 +34,14 @@ from petfsi.fields.sph.skin import Skin
 from petfsi.fields.sph.start import Start
 from petfsi.fields.sph.viscosity import THETA, ImplicitViscosity
 from petfsi.fields.sph.walls import Walls
+from petfsi.fields.stored import outside, refuse
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene
 
 #: What a checkpoint holds besides "id" and "x".
 STORED = ("v", "rho", "m", "a", "S")
+#: Densities and masses are more.
+_LEAST = float(np.finfo(float).tiny)
 
 
 class SphFluid(FluidField):
@@ -400,11 +403,18 @@ class SphFluid(FluidField):
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
-        self.swarm.restore(read, STORED)
+        try:
+            self.swarm.restore(read, STORED)
+        except StrayError as error:
+            raise ValueError(f"'x': {error}") from error
+        matter = {name: self.swarm[name] for name in ("rho", "m")}
+        refuse(self.comm, [outside(name, values, _LEAST, np.inf) for name, values in matter.items()])
         if self.skin is not None:
-            self.skin.last = read_whole(read, "skin_force").reshape(-1, self.dim)
+            last = self.skin.last
+            self.skin.last = read_whole(read, "skin_force", last.size).reshape(last.shape)
         for name, values in self.kept.items():
-            values[...] = read_whole(read, name).reshape(values.shape)
+            values[...] = read_whole(read, name, values.size).reshape(values.shape)
+        refuse(self.comm, self.openings.faults())
         self._forget_step()
         self._pushed = True  # a is that of the forces
         self._measure_speeds()

@@ -25,6 +25,7 @@ from petfsi.fields.sph.kernels import shape
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.particles import Swarm
 from petfsi.fields.sph.room import Room
+from petfsi.fields.stored import EXACT, outside
 
 
 class Openings:
@@ -69,6 +70,14 @@ class Openings:
         for inlet, part in zip(inlets, self._parts, strict=True):
             self._way[part] = 0.5 * inlet.width[inlet.axis]
             self._speed[part] = inlet.speed(0.0)
+
+    def faults(self) -> list[str]:
+        """Return what cannot be of numbers that a file holds."""
+        most = 2 * max((float(inlet.width[inlet.axis]) for inlet in self.inlets), default=0.0)
+        return [
+            outside("passed", self._passed[:1], 0, EXACT, whole=True),
+            outside("columns", self._way, -most, most),
+        ]
 
     # ---- in a step -------------------------------------------------------------------------------------------------
 

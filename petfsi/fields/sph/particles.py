@@ -14,6 +14,7 @@ from petfsi.fields.base import Reader, Slab, State, scalar_slab
 from petfsi.fields.sph.balance import Boxes, bisect, is_better, is_uneven, located, seen
 from petfsi.fields.sph.cells import CellGrid, sorted_rows
 from petfsi.fields.sph.transport import Packing, Traffic, ship
+from petfsi.fields.stored import EXACT, outside, refuse
 
 
 class StrayError(SolveError):
@@ -367,15 +368,24 @@ class Swarm:
 
         The set is rebuilt, in boxes that are shared out anew.
         """
-        n = int(read("count", (0,), (1,))[0])
+        count = read("count", (0,), (1,))
+        refuse(self.comm, [outside("count", count, 0, EXACT, whole=True)])
+        n = int(count[0])
         begin, end = (n * r // self.comm.size for r in (self.comm.rank, self.comm.rank + 1))
         rows = {}
         for name in self._with_id(names):
             width = self._kinds[name][1]
             rows[name] = read(name, (begin, *(0 for _ in width)), (end - begin, *width))
+        refuse(self.comm, [self._id_fault(rows["id"])])
         self._keep(np.zeros(0, dtype=np.int64))
         self.insert(rows)
         self.rebuild(self._bisected())
+
+    def _id_fault(self, id: np.ndarray) -> str:
+        """Return what is wrong with the ids that ranks have read, one after the other. Collective."""
+        last = [of for of in self.comm.allgather(id[-1:])[: self.comm.rank] if len(of)]
+        ascends = np.all(np.diff(np.concatenate([*last[-1:], id])) > 0)
+        return outside("id", id, 0, EXACT) or ("" if ascends else "'id' does not ascend, or has a number twice")
 
     def _with_id(self, names: Iterable[str] | None) -> list[str]:
         return list(self._columns if names is None else dict.fromkeys(["id", "x", *names]))
