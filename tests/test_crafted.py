@@ -1,4 +1,4 @@
-"""A run directory from somebody else: arrays that cannot be, with a right checksum.
+"""A run directory from somebody else: arrays that cannot be, with a right checksum, and links in what is drawn.
 
 What is in range may be any state, and is computed with; what is not is refused by name before anything is computed.
 """
@@ -152,3 +152,46 @@ def test_so_is_what_another_run_begins_with(copied, made, capfd):
     assert cli.main(["run", str(made / "sheet.toml"), "--from", str(run), "--out", "new"]) == 2
     told = capfd.readouterr().err
     assert str(path) in told and "parts_cell" in told and not Path("new").exists()
+
+
+# ---- pictures ---------------------------------------------------------------------------------------------------
+
+
+def outside(run, name):
+    """Put a link in place of a run's own file or folder."""
+    place = Path("outside")
+    if (run / name).exists():
+        shutil.move(run / name, place)
+    else:
+        place.mkdir()
+    (run / name).symlink_to(place.absolute())
+
+
+@pytest.mark.parametrize(
+    "name, words", [("pictures", []), ("pictures", ["--film"]), ("fields", []), ("fields/000001.h5", [])]
+)
+def test_links_in_a_run_are_not_followed_when_it_is_drawn(copied, capfd, name, words):
+    run = copied("sheet")
+    outside(run, name)
+    assert cli.main(["plot", str(run), *words]) == 2
+    assert str(run / name) in capfd.readouterr().err.replace("\n", "")
+    assert not Path("outside").is_dir() or not list(Path("outside").glob("*.[pg][ni][gf]"))
+
+
+def test_nor_are_links_in_its_files(copied, capfd):
+    run = copied("sheet")
+    with h5py.File(run / "fields" / "000001.h5", "r+") as file:
+        del file["solid/displacement"]
+        file["solid/displacement"] = h5py.ExternalLink("other.h5", "x")
+    assert cli.main(["plot", str(run)]) == 2
+    assert "'solid/displacement' of it lies elsewhere" in " ".join(capfd.readouterr().err.split())
+
+
+def test_a_picture_replaces_a_link(copied):
+    run = copied("sheet")
+    (run / "pictures").mkdir()
+    Path("precious").write_text("precious")
+    for name in ("history.png", "000001.png"):
+        (run / "pictures" / name).symlink_to(Path("precious").absolute())
+    assert cli.main(["plot", str(run)]) == 0
+    assert Path("precious").read_text() == "precious" and not (run / "pictures" / "000001.png").is_symlink()

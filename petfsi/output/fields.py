@@ -203,7 +203,7 @@ class FieldWriter:
             size, found = files.digest(self._mesh)
             whole = (size, found) == (known.mesh.bytes, known.mesh.blake2b)
             if whole:
-                with h5py.File(self._mesh, "r") as file:
+                with hdf5.reading(self._mesh) as file:
                     self._static, self._mesh_mark = _stored(file), known.mesh
         except OSError:
             whole = False
@@ -280,8 +280,7 @@ class Indexes:
 def _entry(path: Path) -> Entry | None:
     """Return what an output file holds; None of one that cannot be read."""
     try:
-        os.close(files.open_plain(path))
-        with h5py.File(path, "r") as file:
+        with hdf5.reading(path) as file:
             return Entry(int(file.attrs["step"]), float(file.attrs["time"]), f"fields/{path.name}", _stored(file))
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError):
         return None

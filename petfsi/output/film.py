@@ -12,7 +12,6 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 
-import h5py
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -21,9 +20,9 @@ from PIL import Image
 from PIL.GifImagePlugin import getdata
 
 from petfsi.errors import InputError, PetfsiError
-from petfsi.output import files
+from petfsi.output import files, hdf5
 from petfsi.output.fields import field_files
-from petfsi.output.pictures import BODIES, scene_figure
+from petfsi.output.pictures import BODIES, UNDRAWABLE, own_pictures, scene_figure
 from petfsi.output.stage import SHOWN, Stage, look_through, read_frame
 from petfsi.output.surroundings import GREY, LINE
 
@@ -82,11 +81,12 @@ def film_run(
         stage = look_through(directory, paths, colour)
         fps = fps or _real_time(paths)
     if file.parent == directory / "pictures":
-        file.parent.mkdir(exist_ok=True)
+        own_pictures(directory)
     if not file.parent.is_dir():
         raise InputError(f"{file}: there is no folder {file.parent}")
     part = files.part_of(file)
     try:
+        part.unlink(missing_ok=True)  # a link would be followed
         write(part, _pictures(directory, stage, paths), fps, stage)
         part.replace(file)
     finally:
@@ -98,7 +98,7 @@ def film_run(
 def _reading(directory: Path) -> Iterator[None]:
     try:
         yield
-    except (OSError, KeyError) as error:
+    except UNDRAWABLE as error:
         raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
 
 
@@ -118,7 +118,7 @@ def _real_time(paths: Sequence[Path]) -> float:
     """Return how many frames a second show a run as fast as it went, within bounds."""
     times = []
     for path in (paths[0], paths[-1]):
-        with h5py.File(path, "r") as file:
+        with hdf5.reading(path) as file:
             times.append(float(file.attrs["time"]))
     lasts = times[1] - times[0]
     return float(np.clip((len(paths) - 1) / lasts, SLOWEST, FASTEST)) if lasts > 0.0 else SLOWEST

@@ -20,6 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from petfsi.errors import InputError
 from petfsi.fields.mac.kinds import FLUID, OBSTACLE, OUTSIDE, SOLID
 from petfsi.geometry.surfaces import boundary_facets
+from petfsi.output import files
 from petfsi.output.fields import field_files
 from petfsi.output.history import read_history
 from petfsi.output.slices import cut_tetrahedra
@@ -33,6 +34,8 @@ _MANY_EDGES = 6000
 #: Arrows along the longer side of a plane.
 _ARROWS = 30
 _DPI = 130
+#: What reading and drawing a file of ``fields/`` raise that petfsi has not written.
+UNDRAWABLE = (OSError, KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 
 
 def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list[Path]:
@@ -58,8 +61,7 @@ def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list
     history, frames = directory / "history.csv", field_files(directory)[::every]
     if not history.exists() and not frames:
         raise InputError(f"{directory} has neither history.csv nor fields, so there is nothing to draw")
-    pictures = directory / "pictures"
-    pictures.mkdir(exist_ok=True)
+    pictures = own_pictures(directory)
     drawn = []
     if history.exists():
         drawn.append(_save(_history_figure(read_history(history)), pictures / "history.png"))
@@ -68,13 +70,28 @@ def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list
             stage = look_through(directory, frames, colour)
             for frame in map(read_frame, frames):
                 drawn.append(_save(scene_figure(stage, frame), pictures / f"{frame.step:06d}.png"))
-        except (OSError, KeyError) as error:
+        except UNDRAWABLE as error:
             raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
     return drawn
 
 
+def own_pictures(directory: Path) -> Path:
+    """Return a run's folder of pictures, and make it; InputError where it, or that of its fields, is a link."""
+    fields, pictures = directory / "fields", directory / "pictures"
+    if fields.is_symlink():
+        raise InputError(
+            f"{fields} is a link, and petfsi follows none in a run directory; put what it names in its place"
+        )
+    try:
+        files.own_directory(pictures)
+    except OSError as error:
+        raise InputError(f"{pictures} cannot be written: {files.reason(error)}") from error
+    return pictures
+
+
 def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path, dpi=_DPI)
+    with open(files.new_file(path), "wb") as file:
+        figure.savefig(file, dpi=_DPI, format="png")
     return path
 
 

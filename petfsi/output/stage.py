@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import h5py
 import numpy as np
 from matplotlib.colors import Normalize
 from scipy.spatial import KDTree
 
 from petfsi.errors import InputError
 from petfsi.fields.mac.kinds import FLUID
+from petfsi.output import hdf5
 from petfsi.output.surroundings import Surroundings, read_surroundings
 from petfsi.output.xdmf import GridInfo
 
@@ -89,7 +89,7 @@ class Stage:
 
 def read_frame(path: Path) -> Frame:
     """Return what a file of ``fields/`` holds."""
-    with h5py.File(path, "r") as file:
+    with hdf5.reading(path) as file:
         fluid = {}
         for name, array in file.get("fluid", {}).items():
             data = array[()]
@@ -120,7 +120,7 @@ def look_through(directory: Path, paths: Sequence[Path], colour: str | None = No
     InputError
         When the run has no such thing, or nothing that can be seen.
     """
-    with h5py.File(directory / "fields" / "mesh.h5", "r") as file:
+    with hdf5.reading(directory / "fields" / "mesh.h5") as file:
         grid = (
             GridInfo(*(json.loads(file.attrs[k]) for k in ("origin", "spacing", "cells"))) if "grid" in file else None
         )
