@@ -25,7 +25,7 @@ import petfsi
 from petfsi.errors import InputError, NotStoredError, SolveError
 from petfsi.fields.base import Reader, Slab
 from petfsi.output import files, hdf5, stored_state
-from petfsi.output.manifest import FORMAT, MAX_BYTES, Manifest, Mark, Record, read_manifest
+from petfsi.output.manifest import FORMAT, HEAD, MAX_BYTES, Manifest, Mark, Record, read_manifest
 from petfsi.ranks import on_root
 
 #: So many entries that a file does not hold are made up, until all ranks have read what they want.
@@ -161,17 +161,28 @@ def _prune(directory: Path, step: int, keep: int) -> None:
     """Remove all but the last ``keep`` up to ``step``, which is known to be good.
 
     Later ones belong to a future that was given up, when a damaged checkpoint made the run go back. One that is
-    evidently damaged does not count among those kept.
+    evidently damaged does not count among those kept. A file beyond ``step`` without a manifest stays: a run writes
+    none so far ahead, and what it has not written is somebody's own.
     """
     kept = 0
     with suppress(OSError):
         for number in reversed(_numbers(directory)):
             whole = number <= step and isinstance(_inspect(directory, number, thorough=False), CheckpointInfo)
             kept += whole
+            if number > step and not _is_ours(directory, number):
+                continue
             if not whole or kept > keep:
                 # in this order: a file without its small one is not taken for a checkpoint
                 (directory / f"{number:06d}.json").unlink(missing_ok=True)
                 (directory / f"{number:06d}.h5").unlink(missing_ok=True)
+
+
+def _is_ours(directory: Path, number: int) -> bool:
+    """Return whether there is a manifest under a number, damaged or not, that begins as petfsi's do."""
+    try:
+        return files.read_plain(directory / f"{number:06d}.json", len(HEAD)).startswith(HEAD)
+    except OSError:
+        return False
 
 
 def _numbers(directory: Path) -> list[int]:

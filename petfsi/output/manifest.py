@@ -17,7 +17,9 @@ from petfsi.output.files import digest_of
 FORMAT = 4
 #: What is longer is no manifest, bytes.
 MAX_BYTES = 1 << 24
-_HEAD = re.compile(rb'\{\n "blake2b": "([0-9a-f]{64})",')
+#: How every manifest begins.
+HEAD = b'{\n "blake2b": "'
+_HEAD = re.compile(re.escape(HEAD) + rb'([0-9a-f]{64})",')
 
 Count = Annotated[int, Field(ge=0, lt=1 << 63)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
