@@ -13,6 +13,7 @@ import pytest
 from petfsi import cli
 from petfsi.output import files
 from petfsi.output.manifest import Mark, read_manifest
+from petfsi.running import Run
 
 SHEET = """
 dim = 2
@@ -105,6 +106,7 @@ CRAFTED = [
     ("sheet", "solid/displacement", at(3, 1e12), "displacement"),
     ("sheet", "solid/velocity_before", at(3, 1e200), "solid/velocity_before"),
     ("sheet", "solid/past_dt", at(0, -1.0), "past_dt"),
+    ("sheet", "pressure/past_dt", at(0, 1e-300), "past_dt"),
     ("sheet", "pressure/cell_kind", at(5, 9), "cell_kind"),
     ("sheet", "pressure/face_kind_y", at(5, 200), "face_kind_y"),
     ("sheet", "pressure/cut_at", at(5, 1e6), "cut_at"),
@@ -195,3 +197,12 @@ def test_a_picture_replaces_a_link(copied):
         (run / "pictures" / name).symlink_to(Path("precious").absolute())
     assert cli.main(["plot", str(run)]) == 0
     assert Path("precious").read_text() == "precious" and not (run / "pictures" / "000001.png").is_symlink()
+
+
+@pytest.mark.parametrize("name", ["history.csv", "fields.xdmf", "fields/outputs.csv"])
+def test_what_somebody_removes_while_a_run_is_at_work_is_named(copied, capfd, monkeypatch, name):
+    run = copied("sheet")
+    take = Run.take_step
+    monkeypatch.setattr(Run, "take_step", lambda *given: ((run / name).unlink(), take(*given)))
+    assert cli.main(["resume", str(run)]) == 3
+    assert f"{run / name} is missing; something else has removed it" in capfd.readouterr().err

@@ -13,6 +13,8 @@ from mpi4py import MPI
 
 #: Integers that floats hold exactly end here.
 EXACT = float(1 << 53)
+#: Steps are longer, s, so that the square of a ratio of two is a number.
+SHORTEST = 1e-50
 
 
 def outside(name: str, values: np.ndarray, low: float, high: float, whole: bool = False) -> str:
@@ -35,3 +37,8 @@ def refuse(comm: MPI.Comm, faults: Iterable[str]) -> None:
     found = [fault for fault in comm.allgather(next(filter(None, faults), "")) if fault]
     if found:
         raise ValueError(found[0])
+
+
+def step_fault(past_dt: float) -> str:
+    """Return in words that this is no length of a last step, s, of which there may be none yet: 0. Not collective."""
+    return "" if past_dt == 0.0 else outside("past_dt", np.array(past_dt), SHORTEST, 1.0 / SHORTEST)

@@ -126,7 +126,12 @@ def reason(error: OSError, needed: int = 0) -> str:
 
 
 def agreed_reason(comm: MPI.Comm, error: OSError, needed: int = 0) -> str:
-    """Return ``reason`` as rank 0 sees it: the room on the disk changes while the ranks look. Collective."""
+    """Return ``reason`` as rank 0 sees it: the room on the disk changes while the ranks look. Collective.
+
+    What a run has made and does not find any more, somebody else has removed.
+    """
+    if error.errno == errno.ENOENT and error.filename:
+        return f"{error.filename} is missing; something else has removed it"
     return on_root(comm, lambda: reason(error, needed))
 
 

@@ -23,7 +23,7 @@ from petfsi.fields.mac.sides import wrapped_points
 from petfsi.fields.mac.transport import TRANSPORTS, Advection
 from petfsi.fields.mac.weight import Weight
 from petfsi.fields.replicated import read_whole, whole_slab
-from petfsi.fields.stored import outside, refuse
+from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.ranks import agreed
 from petfsi.scene import fluids
 from petfsi.scene.expressions import Expression, evaluate_at
@@ -666,7 +666,7 @@ class MacFluid(CoveredGrid):
 
     def _kind_faults(self, past_dt: float) -> Iterator[str]:
         """Yield what cannot be of kinds that a file holds: obstacles and sides are the scene's."""
-        yield outside("past_dt", np.array(past_dt), 0.0, np.inf)
+        yield step_fault(past_dt)
         yield outside("cell_kind", self.cell_kind[self.grid.owned(None)], kinds.FLUID, kinds.OUTSIDE)
         for kind, letter, axis in zip(self.face_kind, "xyz", self._axes, strict=False):
             yield outside(f"face_kind_{letter}", kind[self.grid.owned(axis)], kinds.DEAD, kinds.SPLIT)

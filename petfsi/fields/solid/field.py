@@ -25,7 +25,7 @@ from petfsi.fields.solid.shrinkage import Shrinkage
 from petfsi.fields.solid.spectrum import largest_eigenvalue
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.fields.solid.turning import Turning, bodies_of
-from petfsi.fields.stored import outside, refuse
+from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
 from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, relinearised, stable_step
@@ -666,7 +666,7 @@ class NodalSolid(SolidField):
             self._measured = places["displacement_measured"] = nodes("displacement_measured")
         most = FAR * self.extent
         faults = [outside(name, x[:, : self.dim], -most, most) for name, x in places.items()]
-        refuse(self.comm, [*faults, outside("past_dt", np.array(self._past_dt), 0.0, np.inf)])
+        refuse(self.comm, [*faults, step_fault(self._past_dt)])
         self._stage = self._geometry = None
 
     def stored(self, name: str, x: np.ndarray) -> dict[str, Slab]:
