@@ -233,7 +233,8 @@ def test_a_step_taken_again_leaves_no_trace(name, transfer, integrator):
                    f" + {0.75 * h}*heaviside(t - {2.875 * h})", 6, (), *sets)  # fmt: skip
     assert again.time == asked.time
     for field, arrays in asked.state().items():
-        for key, slab in arrays.items():
+        # the clock of equal steps is not that of steps that an expression gives
+        for key, slab in arrays.items() if field != "clock" else ():
             other = again.state()[field][key].data
             size = asked.comm.allreduce(np.abs(slab.data).max(initial=0.0), op=MPI.MAX)
             # what is nought but for round-off, as the sideways part of an upright wall, has no size of its own
