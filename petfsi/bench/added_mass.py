@@ -97,7 +97,7 @@ class Body:
             "fluid.cells": [self.cells] * dim,
             "coupling.transfer": self.transfer,
             f"solids.{name}.density": self.ratio * DENSITY,
-            f"solids.{name}.young": YOUNG,
+            f"solids.{name}.young": YOUNG * max(1.0, self.ratio),  # as rigid beside its own inertia
             f"solids.{name}.shape.ball.cells": 2 * round(ELEMENTS_PER_CELL[dim] * self.cells / 2),
             f"solids.{name}.initial.velocity": list(kicked),
         }
