@@ -212,7 +212,7 @@ def test_checkpoints_have_room_for_regions_that_close_and_open():
     with prepared(scene_from_dict(data), *DIRECT, comm=COMM) as sim:
         shapes = []
         while len(shapes) < 6:
-            shapes.append({name: slab.shape for name, slab in sim.regions.state().items()})
+            shapes.append({name: slab.shape for name, slab in sim.state()["regions"].items()})
             sim.advance()
         assert np.isnan(sim.regions.volumes).all()
     assert all(shape == shapes[0] for shape in shapes)
