@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 
 for name, value in {
     "OMP_NUM_THREADS": "1",
@@ -17,6 +18,8 @@ for name, value in {
 
 import pytest  # noqa: E402 - MPI and HDF5 read the environment when they are imported
 from mpi4py import MPI  # noqa: E402
+
+from petfsi.stop import SIGNALS  # noqa: E402
 
 
 @pytest.hookimpl(trylast=True)
@@ -37,24 +40,37 @@ def pytest_runtest_logreport(report):
         MPI.COMM_WORLD.Abort(1)
 
 
+@contextmanager
+def nothing_left():
+    """Undo what a command leaves in this process: how it hears signals, and PETSc's options."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
+    if "petsc4py.PETSc" in sys.modules and sys.modules["petsc4py.PETSc"].Sys.isInitialized():
+        options = sys.modules["petsc4py.PETSc"].Options()
+        for name in options.getAll():
+            options.delValue(name)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item):
+    """Let nothing of a test, fixtures of its module included, reach the next one."""
+    with nothing_left():
+        yield
+
+
 @pytest.fixture
 def here(capfd):
     """Return a function that runs a command in this process."""
-
     from petfsi import cli
-    from petfsi.stop import SIGNALS
 
     def run(*words):
-        before = {number: signal.getsignal(number) for number in SIGNALS}
         capfd.readouterr()
-        code = cli.main([str(word) for word in words])
+        with nothing_left():
+            code = cli.main([str(word) for word in words])
         out, err = capfd.readouterr()
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if "petsc4py.PETSc" in sys.modules:
-            options = sys.modules["petsc4py.PETSc"].Options()
-            for name in options.getAll():
-                options.delValue(name)
         return subprocess.CompletedProcess(words, code, out, err)
 
     return run

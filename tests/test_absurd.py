@@ -94,6 +94,7 @@ def test_values_too_deep_or_too_long_are_refused(text):
         (b'title = "' + b"x" * 9000 + b'"', "a text may have 5000 characters, not 9000"),
         (b"k" * 9000 + b" = 1", "a key may have 200 characters, not 9000"),
     ],
+    ids=["digits", "tables", "dots", "dots in quotes", "size", "mark", "null", "text", "key"],
 )
 def test_no_text_takes_long(tmp_path, content, said):
     path = tmp_path / "scene.toml"
