@@ -74,7 +74,9 @@ def test_what_is_merely_unusual_is_taken():
 
 
 @pytest.mark.parametrize(
-    "text", ["a.b.c=" + "[" * 50 + "]" * 50, "x=" + "9" * 5000, "x=0x" + "f" * 9000, "a=" + "[" * 3000]
+    "text",
+    ["a.b.c=" + "[" * 50 + "]" * 50, "x=" + "9" * 5000, "x=0x" + "f" * 9000, "a=" + "[" * 3000],
+    ids=["lists", "digits", "hexadecimal", "open lists"],
 )
 def test_values_too_deep_or_too_long_are_refused(text):
     with pytest.raises(InputError, match="nested|64 bits|too many digits"):

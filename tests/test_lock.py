@@ -78,7 +78,11 @@ def test_of_another_machine_only_its_age_is_known(tmp_path):
             acquire(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"pid": 1}', "[" * 100000, "\0" * 50])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "{}", '{"pid": 1}', "[" * 100000, "\0" * 50],
+    ids=["empty", "list", "table", "pid", "deep", "null"],
+)
 def test_a_lock_that_names_nobody_is_left(tmp_path, text):
     (tmp_path / NAME).write_text(text)
     with pytest.raises(InputError, match=r"a process that it does not name; it was last seen .* remove"):
