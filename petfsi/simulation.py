@@ -15,8 +15,7 @@ from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
 from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
-from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
-from petfsi.fields.solid.field import FAR
+from petfsi.fields.base import FAR, Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
 from petfsi.guard import EnergyGuard
 from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene

@@ -22,6 +22,13 @@ from mpi4py import MPI  # noqa: E402
 from petfsi.stop import SIGNALS  # noqa: E402
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_itemcollected(item):
+    """Mark what starts several ranks: beside tests that use the cores, each of their messages waits for a turn."""
+    if hasattr(item, "callspec") and item.callspec.params.get("ranks", 1) > 1:
+        item.add_marker("launches")
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     """Keep the tests for this number of ranks: ``mpiexec -n 3 pytest`` runs those marked ``parallel(3)``."""
@@ -48,6 +55,8 @@ def nothing_left():
     for number, handler in before.items():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
+    if "petfsi.option_database" in sys.modules:
+        sys.modules["petfsi.option_database"].put(sys.modules["petfsi.options"].Options())
     if "petsc4py.PETSc" in sys.modules and sys.modules["petsc4py.PETSc"].Sys.isInitialized():
         options = sys.modules["petsc4py.PETSc"].Options()
         for name in options.getAll():

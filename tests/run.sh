@@ -12,8 +12,12 @@ bash jobs/setup.sh
 
 # ranks that share cores spin while they wait; yielding lets the others work
 export OMPI_MCA_mpi_yield_when_idle=1
-# a process per core; who has nothing left takes tests from the others
-.venv/bin/python -m pytest -q -n auto --dist worksteal --durations=10 "$@"
+# many processes are started: each module is compiled once
+unset PYTHONDONTWRITEBYTECODE
+# a process per core; who has nothing left takes tests from the others (5: of those asked for none is there)
+.venv/bin/python -m pytest -q -n auto --dist worksteal --durations=10 -m "not launches" "$@" || [ $? = 5 ]
+echo "== processes of several ranks"
+.venv/bin/python -m pytest -q --durations=5 -m launches "$@" || [ $? = 5 ]
 for ranks in 2 3 4; do
     echo "== $ranks ranks"
     # all ranks say the same: rank 0's last line is enough, unless a test fails on one of them and the others wait

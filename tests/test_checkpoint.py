@@ -193,6 +193,7 @@ def run(code, directory, ranks):
     return run_on(ranks, PREAMBLE + textwrap.dedent(code), directory)
 
 
+@pytest.mark.launches
 def test_three_ranks_write_what_two_read(tmp_path):
     done = run('write_checkpoint(directory, 4, 0.4, 0.1, slabs(state(3), comm), {"a": 1}, comm, 1)', tmp_path, 3)
     assert done.returncode == 0, done.stderr

@@ -225,6 +225,7 @@ sys.exit(cli._together(work))
 """
 
 
+@pytest.mark.launches
 def test_ranks_that_fail_together_speak_once():
     done = petfsi(ranks=2, code=TOGETHER.format(patience=20, body="raise SolveError('step 7: DIVERGED')"))
     assert done.returncode == 3
@@ -238,6 +239,7 @@ def test_a_rank_that_fails_alone_ends_the_others():
     assert "rank 1 of 2 failed alone: IndexError: list index out of range" in done.stderr
 
 
+@pytest.mark.launches
 def test_ranks_with_different_stories_tell_them_all():
     body = "raise InputError(f'rank {comm.rank} saw a mistake')"
     done = petfsi(ranks=2, code=TOGETHER.format(patience=20, body=body))
@@ -245,6 +247,7 @@ def test_ranks_with_different_stories_tell_them_all():
     assert "rank 0 saw a mistake" in done.stderr and "rank 1 saw a mistake" in done.stderr
 
 
+@pytest.mark.launches
 def test_a_broken_scene_is_reported_once_under_mpirun(scene):
     done = petfsi("run", scene, "--set", "time.dt=-1", ranks=2)
     assert done.returncode == 2

@@ -655,11 +655,13 @@ def test_the_wall_limit_stops_the_run_in_time(scene, ranks):
 # ---- on two ranks -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.launches
 def test_ranks_that_the_grid_cannot_feed(scene):
     done = petfsi("run", scene, "--out", "out", ranks=3)
     is_refused(done, "out", "fluid.cells = [12, 8]: 3 ranks cannot share this grid", "that works is 2")
 
 
+@pytest.mark.launches
 @pytest.mark.parametrize(
     "text, words, said",
     [
@@ -677,6 +679,7 @@ def test_two_ranks_refuse_with_one_voice(scene, text, words, said):
     is_refused(petfsi("run", scene, "--out", "out", *words, ranks=2), "out", said)
 
 
+@pytest.mark.launches
 def test_a_log_of_mpirun_has_no_escape_codes(scene):
     slowly = ["--set", "fluid.sides.left.inflow.ramp=0.2"]
     done = petfsi("run", scene, "--out", "out", "--steps", 2, *slowly, ranks=2)

@@ -414,6 +414,7 @@ def petfsi(*words, ranks):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.launches
 def test_ranks_may_be_others(scene, command):
     """What two ranks began, four take up, and one goes on with."""
     Path(scene).write_text(BLOCK + WATER.replace("[10, 12]", "[12, 24]"))

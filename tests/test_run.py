@@ -180,6 +180,7 @@ def test_a_step_that_is_not_positive_ends_the_run_with_its_time(tmp_path):
     assert "must be greater than" in done.stderr and summary(tmp_path / "run")["status"] == "failed"
 
 
+@pytest.mark.launches
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_two_ranks_and_then_three_equal_one_with_any_integrator(integrator, tmp_path):
     sets = ("--set", f"time.integrator={integrator}", "--set", "output={}", "--set", "time.end=0.4")
@@ -192,6 +193,7 @@ def test_two_ranks_and_then_three_equal_one_with_any_integrator(integrator, tmp_
         np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-8 * np.abs(one[name]).max())
 
 
+@pytest.mark.launches
 def test_two_ranks_go_on_as_three(straight, tmp_path):
     petfsi("run", BAR, "--out", tmp_path / "run", "--steps", 13, ranks=2)
     petfsi("resume", tmp_path / "run", ranks=3)
@@ -200,6 +202,7 @@ def test_two_ranks_go_on_as_three(straight, tmp_path):
         np.testing.assert_allclose(got[name], want[name], rtol=0, atol=1e-8 * np.abs(want[name]).max(initial=1.0))
 
 
+@pytest.mark.launches
 def test_any_number_of_ranks_gives_the_same_history(tmp_path):
     histories = []
     for ranks in (1, 2, 3, 4):

@@ -14,6 +14,9 @@ from petsc4py import PETSc
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import Layout
 
+#: How far from the origin solids may begin, and go, over their extent: round-off leaves seven digits of it.
+FAR = 1e9
+
 
 @dataclass(frozen=True)
 class Slab:

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Forces, Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.base import FAR, Forces, Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
 from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
@@ -36,13 +36,12 @@ from petfsi.scene.schema import Scene, Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Number
 
-#: How far from the origin solids may begin, and go, over their extent: round-off leaves seven digits of it.
-FAR = 1e9
-
 #: The least mass that rows can be measured against, kg; of the greatest the inverse.
 LIGHTEST = 1e-150
 #: What is left of forces that cancel, as a part of them.
 UNPUSHED = 1e-9
+#: By how much of itself the diagonal grows where stress that has yet to come will hold a body in statics.
+FIRMER = 1e-8
 
 
 class NodalSolid(SolidField):
@@ -226,6 +225,7 @@ class NodalSolid(SolidField):
             vectors.append(vector)
         self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
         self._diagonal = (0.0, 0.0), 1.0
+        self._awaits_stress = False
         self._assembled_for = 0.0, 0.0, 0.0, 0.0, 0  # a, k, dt, the mass in row_scale, and what was added
         self._added = AddedRows(self.comm)
 
@@ -290,6 +290,8 @@ class NodalSolid(SolidField):
             self._loads.assemble(time + self._integrator.moment(dt), state, stage.k, values, b)
         self._prescribe(stage, time, dt)
         if values is not None:
+            if self._awaits_stress:  # A alone is singular: round-off would say how far the body turns
+                values[self._on_diagonal()] *= 1.0 + FIRMER
             self._elimination.empty(values, diagonal)
             self._fill(self._pattern.indptr, self._pattern.indices)
             self._assembled_for = made_for
@@ -366,6 +368,7 @@ class NodalSolid(SolidField):
         if stage is None or stage.k == 0 or self.is_linear:
             return False
         self._stage = relinearised(stage, x.reshape(-1, self.width))
+        self._awaits_stress = False
         return True
 
     def jolt(self) -> np.ndarray | None:
@@ -404,6 +407,7 @@ class NodalSolid(SolidField):
             found.setdefault(motion.body, []).append((motion, push))
             if push or not steadies:
                 wrong.append(motion.body)
+        self._awaits_stress = bool(found) and not wrong
         return [refusal(self.names[body], found[body], self.dim) for body in dict.fromkeys(wrong)]
 
     def _pushed(self, motion: RigidMotion, force: np.ndarray) -> tuple[float, bool]:
@@ -507,6 +511,11 @@ class NodalSolid(SolidField):
             )
         self._reference_mass = reference_mass
 
+    def _on_diagonal(self) -> np.ndarray:
+        """Return which of A's entries on this rank are on its diagonal."""
+        rows = np.repeat(np.arange(self.layout.n_local), np.diff(self._pattern.indptr))
+        return self._pattern.indices == rows + self.layout.start
+
     def _mean_diagonal(self, stage: Stage) -> float:
         """Return what stands in rows of prescribed unknowns: inertia, in statics the mean of A's diagonal. Collective.
 
@@ -519,8 +528,7 @@ class NodalSolid(SolidField):
             rest = np.zeros((len(self._mesh.points), self.width))
             state, b = State(rest, rest, rest), np.empty((self._mesh.n_owned, self.width))
             self._elements.assemble(state, stage.a, stage.k, self._pattern, self._values, b)
-            rows = np.repeat(np.arange(self.layout.n_local), np.diff(self._pattern.indptr))
-            total = self._values[self._pattern.indices == rows + self.layout.start].sum()
+            total = self._values[self._on_diagonal()].sum()
             diagonal = self.comm.allreduce(float(total)) / self.layout.n_global
             self._diagonal = (stage.a, stage.k), diagonal
         return diagonal
