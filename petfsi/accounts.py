@@ -11,8 +11,8 @@ from petfsi.couplings.base import Coupling
 from petfsi.fields.base import Field, Reader, Slab, SolidField, Work, scalar_slab
 from petfsi.force_work import ForceWork
 from petfsi.integrators import INTEGRATORS
-from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
+from petfsi.solving.regions import ClosedRegions
 
 #: The columns that are summed over steps.
 SUMMED = ("potential", "dissipated", "load_work", "boundary_work")

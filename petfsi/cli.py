@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from petfsi import __version__
-from petfsi.console import open_streams
 from petfsi.errors import PetfsiError
 from petfsi.messages import screen, shown
+from petfsi.runs.console import open_streams
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -129,7 +129,7 @@ def run(
 
         loaded = on_root(comm, lambda: load_scene(scene, sets))
         _start_petsc(petsc, comm)
-        from petfsi.run import run_scene
+        from petfsi.runs.run import run_scene
 
         return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets, source)
 
@@ -154,7 +154,7 @@ def resume(
 
     def work(comm: MPI.Comm) -> int:
         _start_petsc(petsc, comm)
-        from petfsi.run import resume_run
+        from petfsi.runs.run import resume_run
 
         return resume_run(directory, steps, petsc, wall_limit, list(sets))
 
@@ -171,8 +171,8 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
     def work() -> int:
         import numpy as np
 
-        from petfsi.memory import refuse_too_large
-        from petfsi.plan import describe_plan, is_rehearsed
+        from petfsi.runs.memory import refuse_too_large
+        from petfsi.runs.plan import describe_plan, is_rehearsed
         from petfsi.scene.load import load_scene
 
         petsc = ctx.meta["petsc"]
@@ -184,7 +184,7 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
                 _start_petsc(petsc)
                 from mpi4py import MPI
 
-                from petfsi.ready import made_ready
+                from petfsi.runs.ready import made_ready
 
                 made_ready(MPI.COMM_SELF, loaded, petsc)
         _say(plan)
@@ -267,7 +267,7 @@ def info(ctx: click.Context) -> NoReturn:
 
     def work() -> int:
         _start_petsc()
-        from petfsi.plan import describe_info
+        from petfsi.runs.plan import describe_info
 
         _say(describe_info())
         return 0
@@ -282,8 +282,8 @@ def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = Non
     """
     import petsc4py
 
-    from petfsi import options
     from petfsi.ranks import on_root
+    from petfsi.solving import options
 
     def read() -> list[str]:
         return [] if words is None else options.resolve(words, os.environ).starting()

@@ -9,20 +9,21 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build, causes, petsc, start
+from petfsi import build, causes, petsc
 from petfsi.accounts import Accounts
-from petfsi.balance import Balance
 from petfsi.couplings.base import Coupling
-from petfsi.diagonal import DiagonalSolver
 from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
 from petfsi.fields.base import FAR, Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
 from petfsi.guard import EnergyGuard
-from petfsi.regions import ClosedRegions
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
-from petfsi.solve import Outcome, Solver
+from petfsi.solving import start
+from petfsi.solving.balance import Balance
+from petfsi.solving.diagonal import DiagonalSolver
+from petfsi.solving.regions import ClosedRegions
+from petfsi.solving.solver import Outcome, Solver
+from petfsi.solving.system import System
 from petfsi.substeps import StableStep
-from petfsi.system import System
 from petfsi.touch import watch
 
 #: By what equal steps are counted: their length, from which step and time.

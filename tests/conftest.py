@@ -19,7 +19,7 @@ for name, value in {
 import pytest  # noqa: E402 - MPI and HDF5 read the environment when they are imported
 from mpi4py import MPI  # noqa: E402
 
-from petfsi.stop import SIGNALS  # noqa: E402
+from petfsi.runs.stop import SIGNALS  # noqa: E402
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -55,8 +55,8 @@ def nothing_left():
     for number, handler in before.items():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
-    if "petfsi.option_database" in sys.modules:
-        sys.modules["petfsi.option_database"].put(sys.modules["petfsi.options"].Options())
+    if "petfsi.solving.option_database" in sys.modules:
+        sys.modules["petfsi.solving.option_database"].put(sys.modules["petfsi.solving.options"].Options())
     if "petsc4py.PETSc" in sys.modules and sys.modules["petsc4py.PETSc"].Sys.isInitialized():
         options = sys.modules["petsc4py.PETSc"].Options()
         for name in options.getAll():

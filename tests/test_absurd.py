@@ -7,10 +7,10 @@ import time
 
 import pytest
 
-from petfsi import memory
 from petfsi.cli import main
 from petfsi.errors import InputError
 from petfsi.messages import COLUMNS, ROWS, screen, shown
+from petfsi.runs import memory
 from petfsi.scene.load import apply_set, load_scene, scene_from_dict
 
 BOX = {"origin": [0.4, 0.4], "size": [0.2, 0.2], "cells": [2, 2]}

@@ -10,9 +10,9 @@ from mpi4py import MPI
 from petfsi.bench import column
 from petfsi.bench.case import only_options
 from petfsi.errors import InputError
-from petfsi.regions import ClosedRegions
 from petfsi.scene.load import scene_from_dict
 from petfsi.simulation import Simulation
+from petfsi.solving.regions import ClosedRegions
 
 COMM = MPI.COMM_WORLD
 PERIODIC = dict.fromkeys(("left", "right", "bottom", "top"), "periodic")

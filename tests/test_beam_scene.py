@@ -5,7 +5,7 @@ import tomllib
 import pytest
 
 from petfsi.errors import InputError
-from petfsi.plan import describe_plan
+from petfsi.runs.plan import describe_plan
 from petfsi.scene.load import apply_set, dump_scene, scene_from_dict
 
 GATE = """

@@ -12,10 +12,10 @@ from mpi4py import MPI
 from processes import environment, launcher
 
 from petfsi import __version__, cli
-from petfsi.console import Console
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.solid import SimplexSolid
-from petfsi.plan import DEFAULT_OPTIONS, default_options, describe_plan, skipped
+from petfsi.runs.console import Console
+from petfsi.runs.plan import DEFAULT_OPTIONS, default_options, describe_plan, skipped
 from petfsi.scene.load import scene_from_dict
 
 SCENE = """
@@ -54,10 +54,10 @@ def scene(tmp_path, monkeypatch):
 def calls(monkeypatch):
     """Stand in for the solver; return what it was called with."""
     seen: list = []
-    module = types.ModuleType("petfsi.run")
+    module = types.ModuleType("petfsi.runs.run")
     module.run_scene = lambda *args: seen.append(args) or 0
     module.resume_run = lambda *args: seen.append(args) or 75
-    monkeypatch.setitem(sys.modules, "petfsi.run", module)
+    monkeypatch.setitem(sys.modules, "petfsi.runs.run", module)
     monkeypatch.setattr(cli, "_start_petsc", lambda words, comm: None)
     return seen
 
@@ -66,7 +66,7 @@ def fail_with(monkeypatch, error):
     def work(*_args):
         raise error
 
-    sys.modules["petfsi.run"].run_scene = work
+    sys.modules["petfsi.runs.run"].run_scene = work
 
 
 def petfsi(*args, ranks=0, code=None, **variables):
@@ -372,8 +372,8 @@ def test_what_is_skipped_has_a_reason():
 
 
 def test_info_lists_versions_prefixes_and_options_files():
-    from petfsi import options
-    from petfsi.plan import describe_info
+    from petfsi.runs.plan import describe_info
+    from petfsi.solving import options
 
     text = describe_info()
     assert f"petfsi:     {__version__}" in text and "PETSc:" in text and "h5py:" in text

@@ -13,7 +13,7 @@ import pytest
 from petfsi import cli
 from petfsi.output import files
 from petfsi.output.manifest import Mark, read_manifest
-from petfsi.running import Run
+from petfsi.runs.running import Run
 
 SHEET = """
 dim = 2

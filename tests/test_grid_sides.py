@@ -7,8 +7,8 @@ from test_two_sides import stepped
 
 from petfsi.bench.case import simulation
 from petfsi.errors import InputError
-from petfsi.fields.mac import kinds
-from petfsi.plan import describe_plan
+from petfsi.fields.mac.grid import kinds
+from petfsi.runs.plan import describe_plan
 from petfsi.scene.load import scene_from_dict
 
 COMM = MPI.COMM_WORLD

@@ -9,8 +9,8 @@ from test_restart import reader
 
 from petfsi.bench.case import only_options
 from petfsi.errors import SolveError
-from petfsi.plan import skipped
-from petfsi.run import run_scene
+from petfsi.runs.plan import skipped
+from petfsi.runs.run import run_scene
 from petfsi.scene.load import scene_from_dict
 
 JOBS = Path(__file__).parents[1] / "jobs"

@@ -7,7 +7,7 @@ from test_cutcell import DIRECT
 from test_two_sides import own_part
 
 from petfsi.bench.case import simulation
-from petfsi.fields.mac import kinds
+from petfsi.fields.mac.grid import kinds
 from petfsi.scene.schema import Scene
 
 N = 12

@@ -7,8 +7,8 @@ import pytest
 from mac_cases import PERIODIC, make_fluid, set_velocity, whole, whole_state
 from mpi4py import MPI
 
-from petfsi.fields.mac import advect, advection
-from petfsi.fields.mac.marks import faces_below
+from petfsi.fields.mac.carrying import advect, advection
+from petfsi.fields.mac.grid.marks import faces_below
 
 
 def smoke_fluid(cells, smoke, comm=MPI.COMM_WORLD, **scene):

@@ -19,8 +19,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.mac import kinds
-from petfsi.fields.mac.transport import TRANSPORTS
+from petfsi.fields.mac.carrying.transport import TRANSPORTS
+from petfsi.fields.mac.grid import kinds
 
 
 def times(fluid, values):

@@ -5,7 +5,7 @@ import pytest
 from mac_cases import BOX, make_fluid, max_divergence, set_velocity, solid_box, solve, whole, whole_state
 from mpi4py import MPI
 
-from petfsi.fields.mac import kinds
+from petfsi.fields.mac.grid import kinds
 
 
 @pytest.mark.parallel([1, 3])

@@ -6,8 +6,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.mac.grid import GHOST, MacGrid
-from petfsi.fields.mac.halo import ranks_per_axis, share_out
+from petfsi.fields.mac.grid.grid import GHOST, MacGrid
+from petfsi.fields.mac.grid.halo import ranks_per_axis, share_out
 
 GRIDS = [
     ((24, 25), (False, False)),

@@ -5,7 +5,7 @@ import pytest
 from mac_cases import PERIODIC, make_fluid, set_velocity, solid_box, step, whole, whole_state
 from mpi4py import MPI
 
-from petfsi.fields.mac.transport import TRANSPORTS
+from petfsi.fields.mac.carrying.transport import TRANSPORTS
 
 SECOND = ["bdf2", "midpoint"]
 END = 0.25

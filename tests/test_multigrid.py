@@ -13,9 +13,9 @@ from petfsi.bench.case import Case, only_options
 from petfsi.bench.solver import first_solve
 from petfsi.bench.solver import scene as falling_bar
 from petfsi.bench.stretched import scene as long_cells
-from petfsi.multigrid import COARSEST, Hierarchy, Lattice, line_weights
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
+from petfsi.solving.multigrid import COARSEST, Hierarchy, Lattice, line_weights
 
 DEFAULT, DIRECT = "monolithic.opts", "monolithic-direct.opts"
 PERIODIC = {"left": "periodic", "right": "periodic"}
@@ -248,7 +248,7 @@ def test_a_light_body_needs_its_motions():
 
 
 def builds(monkeypatch, scene, *more, steps=8):
-    from petfsi.schur import SchurStandIn
+    from petfsi.solving.schur import SchurStandIn
 
     count = []
     refresh = SchurStandIn.refresh

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from step_cases import prepared
 
 from petfsi.errors import InputError, NoSolutionError
-from petfsi.ready import made_ready
+from petfsi.runs.ready import made_ready
 from petfsi.scene.schema import Scene
 
 # ---- flows that have nowhere to go --------------------------------------------------------------------------

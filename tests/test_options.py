@@ -5,10 +5,18 @@ import random
 
 import pytest
 
-from petfsi import options
 from petfsi.errors import InputError
-from petfsi.option_rules import fault
-from petfsi.options import COMMAND_LINE, ENVIRONMENT, from_file, from_words, resolve, resolve_stored, shipped_options
+from petfsi.solving import options
+from petfsi.solving.option_rules import fault
+from petfsi.solving.options import (
+    COMMAND_LINE,
+    ENVIRONMENT,
+    from_file,
+    from_words,
+    resolve,
+    resolve_stored,
+    shipped_options,
+)
 
 P = "fieldsplit_pressure"
 PRESSURE = f"fsi_{P}_"

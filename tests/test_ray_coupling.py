@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from petfsi.couplings.quadrature import area_normals
 from petfsi.couplings.ray import RayCoupling
 from petfsi.fields.mac.fluid import MacFluid
-from petfsi.fields.mac.kinds import FLUID, PRESSURE, SOLID, SOLID_FACE, VOID
+from petfsi.fields.mac.grid.kinds import FLUID, PRESSURE, SOLID, SOLID_FACE, VOID
 from petfsi.fields.solid.solid import SimplexSolid
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import Layout

@@ -7,7 +7,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from petfsi.petsc import IntType, Layout, factorised
-from petfsi.resisted import Resisted
+from petfsi.solving.resisted import Resisted
 
 #: Pressures, the solid's unknowns and pushed cells.
 N, M, K = 17, 11, 5

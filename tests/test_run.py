@@ -18,8 +18,8 @@ from mpi4py import MPI
 from processes import environment, launcher
 
 from petfsi.bench.case import job, simulation
-from petfsi.options import shipped_options
 from petfsi.output.history import read_history
+from petfsi.solving.options import shipped_options
 
 SCENES = Path(__file__).parent / "scenes"
 BAR = SCENES / "bar2d.toml"

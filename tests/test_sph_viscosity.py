@@ -7,11 +7,11 @@ import pytest
 from mpi4py import MPI
 from test_sph import PERIODIC, SELF, SQUARE, VORTICES, WORLD, Stored, owned, prepared, scene, taylor_green, whole
 
-from petfsi import plan
 from petfsi.bench import particles_flows as flows
 from petfsi.bench.case import dense, only_options
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.sph.passes import Passes
+from petfsi.runs import plan
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from step_cases import loaded, motion, prepared
 
 from petfsi.scene.load import scene_from_dict
-from petfsi.solve import Solver
+from petfsi.solving.solver import Solver
 
 SCENES = Path(__file__).parent / "scenes"
 OPTIONS = {

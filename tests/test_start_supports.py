@@ -7,7 +7,7 @@ from step_cases import block, prepared
 from test_start import velocities
 
 from petfsi.scene.load import scene_from_dict
-from petfsi.solve import Solver
+from petfsi.solving.solver import Solver
 
 IMPLICIT = ["newmark", "bdf2", "midpoint"]
 RHO, STIFF, DT, SPEED, OMEGA = 1000.0, 1e14, 0.01, 1.5, 1e-3

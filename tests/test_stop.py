@@ -15,9 +15,9 @@ from mpi4py import MPI
 from processes import environment
 
 from petfsi import cli
-from petfsi.kept import Kept
 from petfsi.output.history import read_history
-from petfsi.stop import SIGNALS, Stop, process_age
+from petfsi.runs.kept import Kept
+from petfsi.runs.stop import SIGNALS, Stop, process_age
 
 PETFSI = Path(sys.executable).with_name("petfsi")
 
@@ -93,7 +93,7 @@ def test_signals_are_heard_unless_they_were_ignored(handlers):
 IN_C = """
 import ctypes, time
 from mpi4py import MPI
-from petfsi.stop import Stop
+from petfsi.runs.stop import Stop
 stop = Stop(MPI.COMM_SELF, None)
 print("ready", flush=True)
 ctypes.PyDLL(None).sleep(1)
@@ -116,7 +116,7 @@ def test_the_second_interrupt_ends_a_process_in_whatever_it_is():
 
 
 def test_the_wall_limit_counts_from_the_start_of_the_process(handlers):
-    code = "import time; time.sleep(0.5); from petfsi.stop import process_age; print(process_age())"
+    code = "import time; time.sleep(0.5); from petfsi.runs.stop import process_age; print(process_age())"
     done = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True)
     assert float(done.stdout) >= 0.5
     stop = Stop(MPI.COMM_SELF, process_age() + 100.0)

@@ -27,10 +27,10 @@ from touch_cases import (
     turning,
 )
 
-from petfsi.balance import Balance
 from petfsi.errors import SolveError, TouchError
 from petfsi.scene.dump import dump_scene
 from petfsi.scene.load import scene_from_dict
+from petfsi.solving.balance import Balance
 from petfsi.touch import TOUCH
 
 #: Bodies whose lowest point is y = 0.5 in the middle of the box, by name: shape, dim, and their shortest edge there.

@@ -14,7 +14,7 @@ from test_restart import goes_on
 
 from petfsi.couplings.enclosure import Enclosure
 from petfsi.errors import SolveError
-from petfsi.fields.mac.cut import Walls
+from petfsi.fields.mac.walls.cut import Walls
 from petfsi.geometry.slabs import area_vectors
 from petfsi.scene.load import scene_from_dict
 

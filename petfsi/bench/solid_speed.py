@@ -22,9 +22,9 @@ from petfsi import petsc
 from petfsi.bench.case import Case
 from petfsi.bench.report import Report, Row
 from petfsi.fields.solid import SimplexSolid
-from petfsi.plan import LARGE_OPTIONS
+from petfsi.runs.plan import LARGE_OPTIONS
 from petfsi.scene.load import scene_from_dict
-from petfsi.solve import PREFIX, only_options
+from petfsi.solving.solver import PREFIX, only_options
 
 DT = 0.1
 #: Of 202,368 tetrahedra.

@@ -17,8 +17,8 @@ from petfsi.bench.potential import Round, sides
 from petfsi.bench.report import Report, Row
 from petfsi.errors import SolveError
 from petfsi.fields.mac.fluid import MacFluid
-from petfsi.fields.mac.kinds import OPEN, PRESSURE, SPLIT
-from petfsi.fields.mac.sides import wrapped_points
+from petfsi.fields.mac.grid.kinds import OPEN, PRESSURE, SPLIT
+from petfsi.fields.mac.grid.sides import wrapped_points
 from petfsi.geometry.meshes import FACET_TYPE
 from petfsi.geometry.obstacles import obstacle_surface
 from petfsi.ranks import on_root

@@ -13,7 +13,7 @@ from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.enclosure import Enclosure
 from petfsi.couplings.walls import WallCoupling
 from petfsi.fields.base import Forces, SolidField, Work
-from petfsi.fields.mac.slivers import outer_products
+from petfsi.fields.mac.projection.slivers import outer_products
 from petfsi.fields.stored import outside, refuse
 from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface
@@ -21,11 +21,11 @@ from petfsi.petsc import IntType, gather_sums, gather_triplets, sum_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
-    from petfsi.fields.mac.cut import Wet
     from petfsi.fields.mac.fluid import MacFluid
+    from petfsi.fields.mac.walls.cut import Wet
 
 
-#: Cells that sheets may go from one cut to the next, see ``fields.mac.lineage``.
+#: Cells that sheets may go from one cut to the next, see ``fields.mac.carrying.lineage``.
 STRIDE = 0.45
 #: A surface goes less than the grid's size in a step; where a file has it so much farther away, it is another's.
 _AWAY = 10.0
@@ -35,7 +35,7 @@ class CutCellCoupling(WallCoupling):
     """Couples a MAC fluid and a solid's surface without loss: D1 H = J^T.
 
     What the walls of a cell let through when they move is J^T u, and J p is the pressure's force on them; see
-    ``fields.mac.cut`` for the entries. The coupling does no work of its own, a closed cavity keeps its volume to
+    ``fields.mac.walls.cut`` for the entries. The coupling does no work of its own, a closed cavity keeps its volume to
     the solver's tolerance, and the system is symmetric quasi-definite.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from petfsi.fields.mac.cut import Walls
+from petfsi.fields.mac.walls.cut import Walls
 from petfsi.geometry.quadratic import Curved
 from petfsi.geometry.slabs import area_vectors
 

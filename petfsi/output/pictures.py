@@ -18,7 +18,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.ndimage import distance_transform_edt
 
 from petfsi.errors import InputError
-from petfsi.fields.mac.kinds import FLUID, OBSTACLE, OUTSIDE, SOLID
+from petfsi.fields.mac.grid.kinds import FLUID, OBSTACLE, OUTSIDE, SOLID
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.output import files
 from petfsi.output.fields import field_files

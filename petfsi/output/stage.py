@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from scipy.spatial import KDTree
 
 from petfsi.errors import InputError
-from petfsi.fields.mac.kinds import FLUID
+from petfsi.fields.mac.grid.kinds import FLUID
 from petfsi.output import hdf5
 from petfsi.output.surroundings import Surroundings, read_surroundings
 from petfsi.output.xdmf import GridInfo

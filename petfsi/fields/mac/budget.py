@@ -15,13 +15,13 @@ import numpy as np
 from numba import njit
 
 from petfsi.fields.base import Stock
-from petfsi.fields.mac.extras import Extras
-from petfsi.fields.mac.faces import Faces
-from petfsi.fields.mac.grid import MacGrid
-from petfsi.fields.mac.kinds import OPEN, PRESSURE, STEP, WALL
-from petfsi.fields.mac.open_sides import OpenSides
-from petfsi.fields.mac.sides import Surroundings
-from petfsi.fields.mac.weight import Weight
+from petfsi.fields.mac.grid.faces import Faces
+from petfsi.fields.mac.grid.grid import MacGrid
+from petfsi.fields.mac.grid.kinds import OPEN, PRESSURE, STEP, WALL
+from petfsi.fields.mac.grid.sides import Surroundings
+from petfsi.fields.mac.projection.extras import Extras
+from petfsi.fields.mac.projection.open_sides import OpenSides
+from petfsi.fields.mac.projection.weight import Weight
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,20 @@ from mpi4py import MPI
 
 from petfsi.errors import InputError
 from petfsi.fields.base import Reader, Slab, Stock, Work, scalar_slab
-from petfsi.fields.mac import advect, budget, kinds, pressure, views
-from petfsi.fields.mac.covered import CoveredGrid
-from petfsi.fields.mac.extrapolate import FAR, Band
-from petfsi.fields.mac.faces import Faces, each
-from petfsi.fields.mac.lineage import Lineage
-from petfsi.fields.mac.marks import beside
-from petfsi.fields.mac.parts import Parts
-from petfsi.fields.mac.sheets import Sheets
-from petfsi.fields.mac.sides import wrapped_points
-from petfsi.fields.mac.transport import TRANSPORTS, Advection
-from petfsi.fields.mac.weight import Weight
+from petfsi.fields.mac import budget, views
+from petfsi.fields.mac.carrying import advect
+from petfsi.fields.mac.carrying.extrapolate import FAR, Band
+from petfsi.fields.mac.carrying.lineage import Lineage
+from petfsi.fields.mac.carrying.sheets import Sheets
+from petfsi.fields.mac.carrying.transport import TRANSPORTS, Advection
+from petfsi.fields.mac.grid import kinds
+from petfsi.fields.mac.grid.faces import Faces, each
+from petfsi.fields.mac.grid.marks import beside
+from petfsi.fields.mac.grid.sides import wrapped_points
+from petfsi.fields.mac.projection import pressure
+from petfsi.fields.mac.projection.covered import CoveredGrid
+from petfsi.fields.mac.projection.weight import Weight
+from petfsi.fields.mac.walls.parts import Parts
 from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.ranks import agreed
@@ -32,7 +35,7 @@ from petfsi.scene.side_notes import side_notes
 from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
-    from petfsi.fields.mac.cutgrid import Openings
+    from petfsi.fields.mac.projection.cutgrid import Openings
 
 #: Less than this part of a jet's area is lost to round-off.
 ROUND_OFF = 1e-9

@@ -1,0 +1,1 @@
+"""The regular staggered grid and its sides: who owns what of it, and what its cells and faces are."""

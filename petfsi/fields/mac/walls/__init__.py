@@ -1,0 +1,1 @@
+"""Surfaces through the grid: which cells and faces they cut, divide, cover and leave again."""
