@@ -234,7 +234,7 @@ MESHES = {
     "tetrahedra": (([*np.eye(3), [0, 0, 0]], [[0, 1, 2, 3]], "tetra"), ["holds no triangle cells", "found tetra"]),
     "lines": ((SQUARE, [[0, 1], [1, 2]], "line"), ["holds no triangle cells, which dim = 2 wants; found line"]),
     "not plane": (([[1, 1, 0], [2, 1, 0], [1, 2, 1]], [[0, 1, 2]]), ["do not lie in one plane"]),
-    "inverted": ((SQUARE, [[0, 1, 2], [0, 3, 2]]), ["1 inverted cells among 2"]),
+    "folded": ((SQUARE, [[0, 1, 2], [0, 1, 3]]), ["1 facets whose two cells lie on the same side"]),
     "twice": ((SQUARE, [*HALVES, [1, 2, 0]]), ["duplicate cells"]),
     "flat": (([*SQUARE, [1.25, 0.5]], [*HALVES, [0, 1, 4]]), ["1 cells with zero volume"]),
     "no number": (([[np.nan, 0.5], *SQUARE[1:]], HALVES), ["1 points with a coordinate that is no number"]),

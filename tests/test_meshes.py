@@ -176,7 +176,7 @@ def test_a_file_that_is_left_handed_throughout_is_turned(tmp_path, dim):
 
 
 BAD = {
-    "inverted": (SQUARE, [[0, 1, 2], [0, 3, 2]], "1 inverted cells among 2"),
+    "folded": (SQUARE, [[0, 1, 2], [0, 1, 3]], "1 facets whose two cells lie on the same side"),
     "zero": (np.vstack((SQUARE, [[0.5, 0.0]])), [*TWO_TRIANGLES, [0, 4, 1]], "1 cells with zero volume"),
     "duplicate cell": (SQUARE, [*TWO_TRIANGLES, [1, 2, 0]], "2 duplicate cells"),
     "duplicate point": (
@@ -239,6 +239,95 @@ def test_cells_that_name_missing_points_are_refused(tmp_path):
     path = write(tmp_path / "bad.vtu", SQUARE, [[0, 1, 2], [0, 2, 9]])
     with pytest.raises(InputError, match="points that the file does not hold"):
         from_file(path)
+
+
+# ---- cells of all kinds -------------------------------------------------------------------------------------
+
+
+def grid_of(kind, n=3, seed=0):
+    """Return points in a random order and cells of one kind that fill a cube of side n."""
+    shape = (n + 1,) * 3
+    place = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.random.default_rng(seed).permutation(len(place))
+    points = np.zeros(place.shape)
+    points[number] = place
+    number = number.reshape(shape)
+    corner = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+    blocks = [number[tuple(slice(c, c + n) for c in at)].ravel() for at in corner]
+    cells = np.stack(blocks, axis=1)
+    if kind == "wedge":
+        cells = cells[:, [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]]].reshape(-1, 6)
+    if kind == "pyramid":
+        faces = [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+        tip = len(points) + np.arange(len(cells))
+        points = np.concatenate((points, points[cells].mean(axis=1)))
+        cells = np.concatenate([np.column_stack((cells[:, face], tip)) for face in faces])
+    return points, cells
+
+
+@pytest.mark.parametrize("kind, each", [("hexahedron", 6), ("wedge", 3), ("pyramid", 2)])
+@pytest.mark.parametrize("seed", range(3))
+def test_other_cells_become_simplices_that_fit_together(tmp_path, kind, each, seed):
+    points, cells = grid_of(kind, seed=seed)
+    path, notes = write(tmp_path / "m.vtu", points, cells, kind), []
+    got, tets = build_mesh(solid(mesh=path.name), 3, "solids.body", tmp_path, notes)
+    volumes = signed_volumes(got, tets)
+    assert len(tets) == each * len(cells) and volumes.min() > 0.01 and volumes.sum() == pytest.approx(27.0)
+    facets = boundary_facets(got, tets)
+    assert len(facets) == 2 * 9 * 6 and np.all(np.ptp(got[facets], axis=1).min(axis=1) == 0)
+    # each cell's own, by their centroids
+    owner = tets.reshape(-1, each, 4) if kind == "hexahedron" else None
+    if owner is not None:
+        assert np.ptp(np.floor(got[owner].mean(axis=2)), axis=1).max() == 0
+    assert notes[0].startswith(f"solids.body.shape.mesh: {len(cells)} cells of type {kind} are cut into {len(tets)}")
+
+
+def test_cells_of_several_kinds_meet(tmp_path):
+    """A hexahedron, a wedge on one side of it and a pyramid on top share faces of four corners."""
+    points = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [2, 0, 0], [2, 0, 1],
+         [0.5, 0.5, 2]], dtype=float
+    )  # fmt: skip
+    for seed in range(10):
+        number = np.random.default_rng(seed).permutation(len(points))
+        x = np.zeros(points.shape)
+        x[number] = points
+        blocks = [
+            ("hexahedron", number[[[0, 1, 2, 3, 4, 5, 6, 7]]]),
+            ("wedge", number[[[1, 8, 2, 5, 9, 6]]]),
+            ("pyramid", number[[[4, 5, 6, 7, 10]]]),
+        ]
+        meshio.Mesh(x, blocks).write(tmp_path / "m.vtu")
+        got, tets = from_file(tmp_path / "m.vtu", 3)
+        assert signed_volumes(got, tets).sum() == pytest.approx(1 + 0.5 + 1 / 3) and len(tets) == 6 + 3 + 2
+
+
+def test_quads_and_triangles_in_the_plane(tmp_path):
+    points = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]]
+    meshio.Mesh(np.array(points, float), [("triangle", [[0, 1, 2], [0, 2, 3]]), ("quad", [[4, 5, 2, 1]])]).write(
+        tmp_path / "m.vtk"
+    )
+    points, cells = from_file(tmp_path / "m.vtk")
+    assert signed_volumes(points, cells).tolist() == pytest.approx([0.5] * 4)
+
+
+def test_what_is_turned_bent_or_not_read_is_told(tmp_path):
+    turned = write(tmp_path / "turned.vtu", SQUARE, [[0, 1, 2], [0, 3, 2]])
+    notes = []
+    points, cells = build_mesh(solid(mesh=turned.name), 2, "s", tmp_path, notes)
+    assert signed_volumes(points, cells).tolist() == [0.5, 0.5]
+    assert notes == ["s.shape.mesh: 1 of 2 cells had their corners in the other order"]
+    six = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, -0.1, 0], [0.5, 0.5, 0], [0, 0.5, 0], [9, 9, 0]], float)
+    meshio.Mesh(six, [("triangle6", [[0, 1, 2, 3, 4, 5]]), ("tetra", [[0, 1, 2, 6]])]).write(tmp_path / "six.vtu")
+    notes = []
+    points, cells = build_mesh(solid(mesh="six.vtu"), 2, "s", tmp_path, notes)
+    assert points.tolist() == [[0, 0], [1, 0], [0, 1]] and cells.tolist() == [[0, 1, 2]]
+    assert [note.removeprefix("s.shape.mesh: ") for note in notes] == [
+        "1 cells of type triangle6 are read by their corners: sides are straight, up to 0.1 (in the file's unit) "
+        "beside the middles of curved ones",
+        "1 cells of type tetra are not read",
+        "1 points that belong to no cell are left out",
+    ]
 
 
 # ---- surfaces in files --------------------------------------------------------------------------------------

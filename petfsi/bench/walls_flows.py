@@ -19,7 +19,7 @@ from petfsi.errors import SolveError
 from petfsi.fields.mac.fluid import MacFluid
 from petfsi.fields.mac.grid.kinds import OPEN, PRESSURE, SPLIT
 from petfsi.fields.mac.grid.sides import wrapped_points
-from petfsi.geometry.meshes import FACET_TYPE
+from petfsi.geometry.meshes import SIMPLEX
 from petfsi.geometry.obstacles import obstacle_surface
 from petfsi.ranks import on_root
 from petfsi.scene.load import scene_from_dict
@@ -175,7 +175,7 @@ def _write(path: str, ball: dict[str, Any], spacing: float) -> None:
     body = Obstacle.model_validate({"shape": {"ball": ball}})
     points, facets = obstacle_surface(body, dim, spacing, np.zeros(dim), np.ones(dim), "body", Path())
     points = np.column_stack((points, np.zeros((len(points), 3 - dim))))
-    meshio.Mesh(points, [(FACET_TYPE[dim], facets)]).write(path, binary=True)
+    meshio.Mesh(points, [(SIMPLEX[dim - 1], facets)]).write(path, binary=True)
 
 
 def impulsive(case: Case, report: Report, dim: int) -> None:

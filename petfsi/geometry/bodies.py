@@ -55,6 +55,18 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
     return meshes
 
 
+def mesh_notes(scene: Scene) -> list[str]:
+    """Return what a user should know of how the files of solids and obstacles are read. Not collective; reads them."""
+    notes: list[str] = []
+    for name, solid in scene.solids.items():
+        if solid.shape.mesh is not None:
+            build_mesh(solid, scene.dim, f"solids.{name}", scene.directory, notes)
+    for name, obstacle in scene.obstacles.items():
+        if obstacle.shape.mesh is not None:
+            read_surface(obstacle.shape, scene.dim, f"obstacles.{name}.shape", scene.directory, notes)
+    return notes
+
+
 def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:
     """Return a sentence for every support and every load that finds nothing to act on."""
     points, facets = _held_points(solid, mesh[0]), mesh[1][:0, :-1]

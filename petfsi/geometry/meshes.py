@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -17,7 +17,9 @@ from scipy.spatial import cKDTree
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
+from petfsi.geometry.quadratic import EDGES
 from petfsi.geometry.shapes import inside
+from petfsi.geometry.splitting import KINDS, Kind, simplices
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.messages import shown
 from petfsi.scene.schema import Solid
@@ -26,15 +28,15 @@ from petfsi.scene.tables import Box, Shape
 if TYPE_CHECKING:
     import meshio
 
-log = logging.getLogger(__name__)
-
 #: A cell is degenerate below this fraction of its longest edge to the power dim.
 FLAT = 1e-12
 #: Points coincide within this fraction of the mesh's extent.
 COINCIDENT = 1e-10
 
-CELL_TYPE = {2: "triangle", 3: "tetra"}
-FACET_TYPE = {2: "line", 3: "triangle"}
+#: The simplex of each dimension, as meshio calls it.
+SIMPLEX = {1: "line", 2: "triangle", 3: "tetra"}
+#: Sides count as straight up to this part of their length.
+STRAIGHT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,9 @@ class SimplexMesh:
         )
 
 
-def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+def build_mesh(
+    solid: Solid, dim: int, key: str, directory: Path, notes: list[str] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return points and positively oriented cells of a solid. Not collective.
 
     Parameters
@@ -114,6 +118,8 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
         Where the table stands in the scene, for messages: ``"solids.layer"``.
     directory : Path
         What a mesh file's path is relative to.
+    notes : list of str, optional
+        Gets what a user should know of how a file was read.
 
     Raises
     ------
@@ -123,7 +129,7 @@ def build_mesh(solid: Solid, dim: int, key: str, directory: Path) -> tuple[np.nd
     shape = solid.shape
     if shape.mesh is not None:
         key = f"{key}.shape.mesh"
-        points, cells = read_mesh(shape, dim, key, directory)
+        points, cells = read_mesh(shape, dim, key, directory, [] if notes is None else notes)
         _check(points, cells, f"{key} = {shape.mesh!r}")
         return points, cells
     if shape.beam is not None:
@@ -171,19 +177,28 @@ def box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:
     return points, (corner + np.concatenate(tets)).reshape(-1, 4)
 
 
-def read_mesh(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and cells of a mesh file, scaled and moved, unused points dropped. Not collective."""
-    points, cells = _read(shape, dim, CELL_TYPE[dim], key, directory)
-    n_points = len(points)
+def read_mesh(shape: Shape, dim: int, key: str, directory: Path, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and positively oriented simplices of a mesh file, scaled and moved. Not collective.
+
+    Cells that are no simplices are cut into some, those of second order are taken by their corners, points of no cell
+    are left out; ``notes`` gets a line for each.
+    """
+    points, cells = _read(shape, dim, dim, key, directory, notes)
     points, cells = _drop_unused(points, cells)
-    if len(points) < n_points:
-        log.info("%s: %d points that belong to no cell are left out", key, n_points - len(points))
-    if np.all(signed_volumes(points, cells) < 0):
-        cells = cells[:, [1, 0, *range(2, dim + 1)]]
-    return points, cells
+    return points, _turned(points, cells, key, notes)
 
 
-def read_surface(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
+def _turned(points: np.ndarray, cells: np.ndarray, key: str, notes: list[str]) -> np.ndarray:
+    """Return cells of which none is left-handed: the order in which a file has corners says nothing of the shape."""
+    left = signed_volumes(points, cells) < 0
+    if left.any() and not left.all():
+        notes.append(f"{key}: {np.count_nonzero(left):,} of {len(cells):,} cells had their corners in the other order")
+    return np.where(left[:, None], cells[:, [1, 0, *range(2, cells.shape[1])]], cells)
+
+
+def read_surface(
+    shape: Shape, dim: int, key: str, directory: Path, notes: list[str] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return points and facets of a closed surface in a file, normals outward. Not collective.
 
     Points in the same place are merged, as formats such as STL repeat them.
@@ -198,8 +213,11 @@ def read_surface(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.
         Where the shape stands in the scene, for messages: ``"obstacles.hull.shape"``.
     directory : Path
         What the path is relative to.
+    notes : list of str, optional
+        Gets what a user should know of how the file was read.
     """
-    points, facets = _read(shape, dim, FACET_TYPE[dim], f"{key}.mesh", directory)
+    told: list[str] = [] if notes is None else notes
+    points, facets = _read(shape, dim, dim - 1, f"{key}.mesh", directory, told)
     where = f"{key}.mesh = {shape.mesh!r}"
     points, merged = np.unique(points, axis=0, return_inverse=True)
     facets = merged.ravel()[facets]
@@ -224,28 +242,66 @@ def open_mesh(shape: Shape, key: str, directory: Path) -> meshio.Mesh:
     path = Path(directory) / str(shape.mesh)
     if not path.is_file():
         raise InputError(f"{key} = {shape.mesh!r}: no file {path}")
+    said = io.StringIO()
     try:
         # on a broken file some readers print, warn or even exit
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             return meshio.read(path)
     except (Exception, SystemExit) as error:
+        why = str(error) if isinstance(error, Exception) else ""
+        words = " ".join(f"{why} {said.getvalue()}".split())
         raise InputError(
-            f"{key} = {shape.mesh!r}: cannot be read as a mesh ({shown(error, 200) or type(error).__name__})"
+            f"{key} = {shape.mesh!r}: cannot be read as a mesh ({shown(words, 300) or type(error).__name__})"
         ) from error
 
 
-def _read(shape: Shape, dim: int, cell_type: str, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return points, scaled and moved, and the cells of one type."""
+def _read(
+    shape: Shape, dim: int, of: int, key: str, directory: Path, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points, scaled and moved, and the simplices of all cells of dimension ``of``."""
     mesh = open_mesh(shape, key, directory)
-    blocks = [block.data for block in mesh.cells if block.type == cell_type and len(block.data)]
-    if not blocks:
-        found = shown(", ".join(sorted({block.type for block in mesh.cells})), 200) or "no cells at all"
-        raise InputError(f"{key} = {shape.mesh!r}: holds no {cell_type} cells, which dim = {dim} wants; found {found}")
-    cells = np.concatenate(blocks).astype(np.int64)
-    points = _as_dim(np.asarray(mesh.points, dtype=float), dim, f"{key} = {shape.mesh!r}")
-    if cells.min() < 0 or cells.max() >= len(points):
-        raise InputError(f"{key} = {shape.mesh!r}: cells name points that the file does not hold")
-    return points * shape.scale + np.array(shape.translate or [0.0] * dim), cells
+    where = f"{key} = {shape.mesh!r}"
+    points = np.asarray(mesh.points, dtype=float)
+    found, unused = [], np.ones(len(points), dtype=bool)
+    for name, kind, nodes in cell_blocks(mesh):
+        if kind is not None and kind.dim == of:
+            if nodes.min() < 0 or nodes.max() >= len(points):
+                raise InputError(f"{where}: cells name points that the file does not hold")
+            unused[nodes] = False
+            found.append(simplices(nodes[:, : kind.corners], of)[0])
+            notes += _taken(points, name, kind, nodes, key, len(found[-1]))
+        elif kind is None and name != "vertex" or kind is not None and kind.dim > of:
+            notes.append(f"{key}: {len(nodes):,} cells of type {name} are not read")
+    if not found:
+        held = shown(", ".join(sorted({name for name, _, _ in cell_blocks(mesh)})), 200) or "no cells at all"
+        raise InputError(f"{where}: holds no {SIMPLEX[of]} cells, which dim = {dim} wants; found {held}")
+    if unused.any():
+        notes.append(f"{key}: {np.count_nonzero(unused):,} points that belong to no cell are left out")
+    points = _as_dim(points, dim, where)
+    return points * shape.scale + np.array(shape.translate or [0.0] * dim), np.concatenate(found)
+
+
+def cell_blocks(mesh: meshio.Mesh) -> Iterator[tuple[str, Kind | None, np.ndarray]]:
+    """Return type, kind if petfsi knows it, and nodes of all blocks of cells but empty ones."""
+    for block in mesh.cells:
+        if len(block.data):
+            kind = KINDS.get(block.type)
+            yield block.type, kind, np.asarray(block.data, dtype=np.int64) if kind else block.data
+
+
+def _taken(points: np.ndarray, name: str, kind: Kind, nodes: np.ndarray, key: str, count: int) -> Iterator[str]:
+    """Say what was done with cells of which simplices were made."""
+    if kind.corners != kind.dim + 1:
+        yield f"{key}: {len(nodes):,} cells of type {name} are cut into {count:,} of type {SIMPLEX[kind.dim]}"
+    if kind.order > 1:
+        bent = ""
+        if kind.corners == kind.dim + 1:
+            ends = points[nodes[:, EDGES[kind.dim]]]
+            middles = points[nodes[:, kind.corners : kind.corners + ends.shape[1]]]
+            off = np.linalg.norm(middles - ends.mean(axis=2), axis=-1)
+            if np.any(off > STRAIGHT * np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)):
+                bent = f", up to {off.max():.3g} (in the file's unit) beside the middles of curved ones"
+        yield f"{key}: {len(nodes):,} cells of type {name} are read by their corners: sides are straight{bent}"
 
 
 def _as_dim(points: np.ndarray, dim: int, where: str) -> np.ndarray:
@@ -280,12 +336,27 @@ def _check(points: np.ndarray, cells: np.ndarray, where: str) -> None:
         for b in range(a):
             np.maximum(longest, np.linalg.norm(points[cells[:, a]] - points[cells[:, b]], axis=1), out=longest)
     _refuse(where, np.count_nonzero(np.abs(volume) <= FLAT * longest**dim), "cells with zero volume")
-    _refuse(where, np.count_nonzero(volume < 0), f"inverted cells among {len(cells)}: orientations are mixed")
+    _refuse(where, np.count_nonzero(volume < 0), "inverted cells")
     _refuse(where, np.count_nonzero(occurrences(cells) > 1), "duplicate cells (the same points more than once)")
+    _refuse(where, _folds(cells), "facets whose two cells lie on the same side: the mesh is folded over itself")
     distance = cKDTree(points).query(points, k=2)[0][:, 1]
     extent = np.ptp(points, axis=0).max()
     _refuse(where, np.count_nonzero(distance <= COINCIDENT * extent), "duplicate points (in the same place)")
     _check_manifold(points, cells, where)
+
+
+def _folds(cells: np.ndarray) -> int:
+    """Return between how many pairs of right-handed cells a facet has both on the same side."""
+    n = cells.shape[1]
+    faces = np.concatenate([np.delete(cells, a, axis=1) for a in range(n)])
+    side = np.repeat([(-1) ** a for a in range(n)], len(cells))
+    order = np.argsort(faces, axis=1)
+    for a in range(n - 1):
+        for b in range(a):
+            side *= np.sign(order[:, a] - order[:, b])
+    _, which, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    total = np.bincount(which.ravel(), weights=side)
+    return int(np.count_nonzero((count == 2) & (total != 0)))
 
 
 def _check_manifold(points: np.ndarray, cells: np.ndarray, where: str) -> None:

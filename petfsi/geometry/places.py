@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from petfsi.errors import InputError
-from petfsi.geometry.meshes import CELL_TYPE, FACET_TYPE, open_mesh
+from petfsi.geometry.meshes import cell_blocks, open_mesh
 from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.shapes import inside
+from petfsi.geometry.splitting import KINDS, simplices
 from petfsi.messages import shown
 from petfsi.scene.schema import Solid, Tagged
 from petfsi.scene.tables import Shape
@@ -42,23 +43,28 @@ def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
     if solid.shape.mesh is None or not any(isinstance(where, Tagged) for where in places):
         return {}
     mesh = open_mesh(solid.shape, f"{key}.shape.mesh", directory)
-    used = np.unique(np.concatenate([block.data for block in mesh.cells if block.type == CELL_TYPE[dim]]))
+    corners = [nodes[:, : kind.corners].ravel() for _, kind, nodes in cell_blocks(mesh) if kind and kind.dim == dim]
+    used = np.unique(np.concatenate(corners))
     number = np.full(len(mesh.points), -1)
     number[used] = np.arange(len(used))
     names = {(int(tag), int(of)): name for name, (tag, of) in mesh.field_data.items()}
     groups: dict[str, list[np.ndarray]] = {}
     for n, block in enumerate(mesh.cells):
-        if block.type != FACET_TYPE[dim]:
+        kind = KINDS.get(block.type)
+        if kind is None or kind.dim != dim - 1 or not len(block.data):
             continue
-        facets = number[block.data]
+        facets, owner = simplices(number[block.data[:, : kind.corners]], kind.dim)
         sets = {name: chosen[n] for name, chosen in mesh.cell_sets.items() if not name.startswith("gmsh:")}
         physical = mesh.cell_data.get("gmsh:physical")
         if physical is not None:
             for tag in np.unique(physical[n][physical[n] > 0]).tolist():
                 sets.setdefault(names.get((tag, dim - 1), str(tag)), physical[n] == tag)
         for name, chosen in sets.items():
-            if chosen is not None and len(facets[chosen]):
-                groups.setdefault(name, []).append(facets[chosen])
+            among = np.zeros(len(block.data), dtype=bool)
+            if chosen is not None:
+                among[chosen] = True
+            if among.any():
+                groups.setdefault(name, []).append(facets[among[owner]])
     return {name: np.concatenate(facets) for name, facets in groups.items()}
 
 

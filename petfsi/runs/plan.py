@@ -60,6 +60,7 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
             raise InputError("\n".join(wrong))
     lines = [shown(scene.title, 200) or "untitled", ""]
     lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, nodes, cells)]
+    lines += [f"{'note:':<13}{note}" for note in mesh_notes(scene)]
     if not is_rehearsed(scene):
         lines.append(f"{'first step:':<13}too large to be made ready here: run judges it before it writes anything")
     lines += [f"{'options:':<13}{_options(scene, nodes, petsc_options)}", "", "skipped:"]
@@ -82,6 +83,16 @@ def default_options(scene: Scene) -> str:
 def _default_options(scene: Scene, nodes: dict[str, int]) -> str:
     large = scene.fluid is None and scene.dim == 3 and scene.dim * sum(nodes.values()) > LARGE
     return LARGE_OPTIONS if large else DEFAULT_OPTIONS
+
+
+def mesh_notes(scene: Scene) -> list[str]:
+    """Return what a user should know of how mesh files are read. Not collective; reads them again."""
+    shapes = [solid.shape for solid in scene.solids.values()] + [one.shape for one in scene.obstacles.values()]
+    if all(shape.mesh is None for shape in shapes):
+        return []
+    from petfsi.geometry import bodies
+
+    return bodies.mesh_notes(scene)
 
 
 def skipped(scene: Scene) -> list[str]:

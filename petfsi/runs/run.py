@@ -22,7 +22,7 @@ from petfsi.ranks import on_root
 from petfsi.runs.console import Console
 from petfsi.runs.legs import describe_changes, find_changes, judge_changes
 from petfsi.runs.origin import Origin
-from petfsi.runs.plan import MAX_COUNTED
+from petfsi.runs.plan import MAX_COUNTED, mesh_notes
 from petfsi.runs.ready import made_ready
 from petfsi.runs.running import DONE, Run
 from petfsi.runs.stop import Stop
@@ -176,6 +176,7 @@ def _greet(console: Console, simulation: Simulation, options: Options, unread: l
     title = shown(simulation.scene.title, 200) or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
+    told.append(on_root(simulation.comm, lambda: mesh_notes(simulation.scene)) if simulation.step == 0 else [])
     for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:
         console.note(note)
     for name in unread:
