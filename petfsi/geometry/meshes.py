@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
+from petfsi.geometry.groups import cell_groups
 from petfsi.geometry.quadratic import EDGES
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, Kind, simplices
@@ -263,30 +264,57 @@ def _read(
     where = f"{key} = {shape.mesh!r}"
     points = np.asarray(mesh.points, dtype=float)
     found, unused = [], np.ones(len(points), dtype=bool)
-    for name, kind, nodes in cell_blocks(mesh):
-        if kind is not None and kind.dim == of:
-            if nodes.min() < 0 or nodes.max() >= len(points):
-                raise InputError(f"{where}: cells name points that the file does not hold")
-            unused[nodes] = False
-            found.append(simplices(nodes[:, : kind.corners], of)[0])
-            notes += _taken(points, name, kind, nodes, key, len(found[-1]))
-        elif kind is None and name != "vertex" or kind is not None and kind.dim > of:
-            notes.append(f"{key}: {len(nodes):,} cells of type {name} are not read")
+    for n, kind, nodes in body_blocks(mesh, shape, of, key):
+        if nodes.min() < 0 or nodes.max() >= len(points):
+            raise InputError(f"{where}: cells name points that the file does not hold")
+        unused[nodes] = False
+        found.append(simplices(nodes[:, : kind.corners], of)[0])
+        notes += _taken(points, mesh.cells[n].type, kind, nodes, key, len(found[-1]))
+    for name, count in _others(mesh, of).items():
+        notes.append(f"{key}: {count:,} cells of type {name} are not read")
     if not found:
-        held = shown(", ".join(sorted({name for name, _, _ in cell_blocks(mesh)})), 200) or "no cells at all"
+        held = shown(", ".join(sorted({block.type for block in mesh.cells if len(block.data)})), 200)
+        held = held or "no cells at all"
         raise InputError(f"{where}: holds no {SIMPLEX[of]} cells, which dim = {dim} wants; found {held}")
-    if unused.any():
+    if unused.any() and shape.cells is None:
         notes.append(f"{key}: {np.count_nonzero(unused):,} points that belong to no cell are left out")
     points = _as_dim(points, dim, where)
     return points * shape.scale + np.array(shape.translate or [0.0] * dim), np.concatenate(found)
 
 
-def cell_blocks(mesh: meshio.Mesh) -> Iterator[tuple[str, Kind | None, np.ndarray]]:
-    """Return type, kind if petfsi knows it, and nodes of all blocks of cells but empty ones."""
+def body_blocks(mesh: meshio.Mesh, shape: Shape, of: int, key: str) -> Iterator[tuple[int, Kind, np.ndarray]]:
+    """Return number, kind and nodes of the blocks of cells that a shape means: those of dimension ``of``, in its group.
+
+    Raises
+    ------
+    InputError
+        If there is no such group.
+    """
+    masks = None
+    if shape.cells is not None:
+        groups = cell_groups(mesh, of)
+        if shape.cells not in groups:
+            known = shown(", ".join(sorted(groups)), 300) or "none at all"
+            where = f"{key.removesuffix('mesh')}cells = {shape.cells!r}"
+            raise InputError(f"{where}: the mesh file has no such group of cells; it has {known}")
+        masks = groups[shape.cells]
+    for n, block in enumerate(mesh.cells):
+        kind = KINDS.get(block.type)
+        if kind is not None and kind.dim == of:
+            nodes = np.asarray(block.data, dtype=np.int64)
+            nodes = nodes if masks is None else nodes[masks[n]]
+            if len(nodes):
+                yield n, kind, nodes
+
+
+def _others(mesh: meshio.Mesh, of: int) -> dict[str, int]:
+    """Return how many cells of which types are neither of dimension ``of`` nor parts of such cells' boundary."""
+    found: dict[str, int] = {}
     for block in mesh.cells:
-        if len(block.data):
-            kind = KINDS.get(block.type)
-            yield block.type, kind, np.asarray(block.data, dtype=np.int64) if kind else block.data
+        kind = KINDS.get(block.type)
+        if len(block.data) and (block.type != "vertex" if kind is None else kind.dim > of):
+            found[block.type] = found.get(block.type, 0) + len(block.data)
+    return found
 
 
 def _taken(points: np.ndarray, name: str, kind: Kind, nodes: np.ndarray, key: str, count: int) -> Iterator[str]:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from petfsi.errors import InputError
-from petfsi.geometry.meshes import cell_blocks, open_mesh
-from petfsi.geometry.quadratic import facets_with_middles
+from petfsi.geometry.groups import cell_groups, point_groups
+from petfsi.geometry.meshes import body_blocks, open_mesh
+from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, simplices
 from petfsi.messages import shown
 from petfsi.scene.schema import Solid, Tagged
 from petfsi.scene.tables import Shape
+
+if TYPE_CHECKING:
+    import meshio
 
 #: Nodes this far from a side of the bounding box, as a fraction of its size, lie on it (files may hold single
 #: precision).
@@ -21,14 +26,28 @@ TOLERANCE = 1e-6
 
 _SIDES = {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1), "back": (2, 0), "front": (2, 1)}
 
-#: The facets of each tag in the numbering of the body's own mesh, corners first: shape (n, dim), or with middles too.
-Tags = dict[str, np.ndarray]
+
+class Tag(NamedTuple):
+    """A group of facets or nodes of a mesh file, in the numbering of the body's own mesh.
+
+    Attributes
+    ----------
+    facets : ndarray of int, shape (n, dim), or with middles too; None of a group of nodes
+        Corners first.
+    nodes : ndarray of int, shape (m,)
+    """
+
+    facets: np.ndarray | None
+    nodes: np.ndarray
+
+
+Tags = dict[str, Tag]
 
 
 def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
-    """Return the groups of facets that a solid's mesh file knows; none, unread, where the scene names no tag.
+    """Return the groups that a solid's mesh file knows; none, unread, where the scene names no tag. Not collective.
 
-    They are gmsh's physical groups, by name or else by number, and other formats' named sets of cells. Not collective.
+    Of facets, see ``groups``; else of nodes, or of the body's cells, whose corners they are then.
 
     Parameters
     ----------
@@ -42,35 +61,48 @@ def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
     places = [*(support.where for support in solid.supports), *(load.where for load in solid.loads)]
     if solid.shape.mesh is None or not any(isinstance(where, Tagged) for where in places):
         return {}
-    mesh = open_mesh(solid.shape, f"{key}.shape.mesh", directory)
-    corners = [nodes[:, : kind.corners].ravel() for _, kind, nodes in cell_blocks(mesh) if kind and kind.dim == dim]
-    used = np.unique(np.concatenate(corners))
+    key = f"{key}.shape.mesh"
+    mesh = open_mesh(solid.shape, key, directory)
+    corners = {n: nodes[:, : kind.corners] for n, kind, nodes in body_blocks(mesh, solid.shape, dim, key)}
+    used = np.unique(np.concatenate([nodes.ravel() for nodes in corners.values()]))
     number = np.full(len(mesh.points), -1)
     number[used] = np.arange(len(used))
-    names = {(int(tag), int(of)): name for name, (tag, of) in mesh.field_data.items()}
-    groups: dict[str, list[np.ndarray]] = {}
-    for n, block in enumerate(mesh.cells):
-        kind = KINDS.get(block.type)
-        if kind is None or kind.dim != dim - 1 or not len(block.data):
-            continue
-        facets, owner = simplices(number[block.data[:, : kind.corners]], kind.dim)
-        sets = {name: chosen[n] for name, chosen in mesh.cell_sets.items() if not name.startswith("gmsh:")}
-        physical = mesh.cell_data.get("gmsh:physical")
-        if physical is not None:
-            for tag in np.unique(physical[n][physical[n] > 0]).tolist():
-                sets.setdefault(names.get((tag, dim - 1), str(tag)), physical[n] == tag)
-        for name, chosen in sets.items():
-            among = np.zeros(len(block.data), dtype=bool)
-            if chosen is not None:
-                among[chosen] = True
-            if among.any():
-                groups.setdefault(name, []).append(facets[among[owner]])
-    return {name: np.concatenate(facets) for name, facets in groups.items()}
+    found: Tags = {}
+    for name, masks in cell_groups(mesh, dim - 1).items():
+        facets = np.concatenate([_simplices(mesh, n, number, mask) for n, mask in enumerate(masks) if mask.any()])
+        facets = facets[(facets >= 0).all(axis=1)]
+        found[name] = Tag(facets, np.unique(facets))
+    for name, points in point_groups(mesh).items():
+        nodes = number[points]
+        found.setdefault(name, Tag(None, np.unique(nodes[nodes >= 0])))
+    for name, masks in cell_groups(mesh, dim).items():
+        kept = [number[mesh.cells[n].data[mask][:, : KINDS[mesh.cells[n].type].corners]] for n, mask in enumerate(masks)
+                if mask.any()]  # fmt: skip
+        nodes = np.unique(np.concatenate([part.ravel() for part in kept]))
+        found.setdefault(name, Tag(None, nodes[nodes >= 0]))
+    return found
+
+
+def _simplices(mesh: meshio.Mesh, n: int, number: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the simplices of some cells of a block, renumbered."""
+    kind = KINDS[mesh.cells[n].type]
+    return simplices(number[np.asarray(mesh.cells[n].data)[chosen, : kind.corners]], kind.dim)[0]
 
 
 def with_middles(tags: Tags, elements: np.ndarray) -> Tags:
-    """Return the same facets with the middles of their edges, where the elements have some."""
-    return {name: facets_with_middles(facets, elements) for name, facets in tags.items()}
+    """Return the same groups with the middles of edges, where the elements have some."""
+    dim = {3: 2, 6: 2, 4: 3, 10: 3}[elements.shape[1]]
+    edges, middles = elements[:, EDGES[dim]], elements[:, dim + 1 :]
+    found = {}
+    for name, (facets, nodes) in tags.items():
+        if facets is not None:
+            facets = facets_with_middles(facets, elements)
+            found[name] = Tag(facets, np.unique(facets))
+        elif middles.size:
+            found[name] = Tag(None, np.union1d(nodes, middles[np.isin(edges, nodes).all(axis=2)]))
+        else:
+            found[name] = Tag(None, nodes)
+    return found
 
 
 def located(where: str | Shape | Tagged, points: np.ndarray, key: str, tags: Tags) -> np.ndarray:
@@ -98,7 +130,7 @@ def located(where: str | Shape | Tagged, points: np.ndarray, key: str, tags: Tag
     lower, upper = points.min(axis=0), points.max(axis=0)
     if isinstance(where, Tagged):
         held = np.zeros(len(points), dtype=bool)
-        held[_tagged(where, key, tags)] = True
+        held[_tagged(where, key, tags).nodes] = True
     elif isinstance(where, Shape):
         held = inside(where, points)
     elif where in ("start", "end"):
@@ -141,10 +173,13 @@ def located_facets(
         If there is none.
     """
     if isinstance(where, Tagged):
-        tagged = _tagged(where, key, tags)[:, : facets.shape[1]]
-        both = np.sort(np.concatenate((facets, tagged)), axis=1)
-        _, group = np.unique(both, axis=0, return_inverse=True)
-        chosen = np.isin(group.ravel()[: len(facets)], group.ravel()[len(facets) :])
+        tag = _tagged(where, key, tags)
+        if tag.facets is None:
+            chosen = np.isin(facets, tag.nodes).all(axis=1)
+        else:
+            both = np.sort(np.concatenate((facets, tag.facets[:, : facets.shape[1]])), axis=1)
+            _, group = np.unique(both, axis=0, return_inverse=True)
+            chosen = np.isin(group.ravel()[: len(facets)], group.ravel()[len(facets) :])
     else:
         chosen = located(where, points, key, tags)[facets].all(axis=1)
     if not chosen.any():
@@ -154,9 +189,8 @@ def located_facets(
     return chosen
 
 
-def _tagged(where: Tagged, key: str, tags: Tags) -> np.ndarray:
+def _tagged(where: Tagged, key: str, tags: Tags) -> Tag:
     if where.tag not in tags:
         known = shown(", ".join(sorted(tags)), 300) or "none at all"
-        raise InputError(f"{key}.where.tag = {where.tag!r}: the mesh file has no such group of facets; it has {known}")
-    facets = tags[where.tag]
-    return facets[(facets >= 0).all(axis=1)]
+        raise InputError(f"{key}.where.tag = {where.tag!r}: the mesh file has no such group; it has {known}")
+    return tags[where.tag]

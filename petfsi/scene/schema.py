@@ -59,9 +59,9 @@ class Damping(Table):
 
 
 class Tagged(Table):
-    """A group of boundary facets that a mesh file has a name (or a number) for."""
+    """A group of boundary facets or of nodes that a mesh file has a name (or a number) for."""
 
-    tag: Annotated[str, Field(min_length=1, description="the name of a group of facets in the mesh file")]
+    tag: Annotated[str, Field(min_length=1, description="the name of a group of facets or nodes in the mesh file")]
 
 
 def _where_form(value: Any) -> str:

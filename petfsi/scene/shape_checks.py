@@ -68,7 +68,7 @@ def _shape(key: str, shape: Shape, dim: int) -> Problems:
         if not any(shape.halfspace.normal):
             yield Problem(f"{key}.halfspace.normal", shape.halfspace.normal, "must not be zero")
     yield from length(f"{key}.translate", shape.translate, dim)
-    for name in ("scale", "translate"):
+    for name in ("cells", "scale", "translate"):
         if shape.mesh is None and name in shape.model_fields_set and getattr(shape, name) not in (1.0, None):
             yield Problem(f"{key}.{name}", getattr(shape, name), "belongs to a mesh file only", (f"{key}.mesh",))
 

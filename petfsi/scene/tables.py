@@ -105,6 +105,7 @@ class Shape(Table):
     halfspace: Halfspace | None = None
     beam: Beam | None = None
     mesh: Annotated[str | None, Field(description="a file that meshio reads")] = None
+    cells: Annotated[str | None, Field(min_length=1, description="which group of a mesh file's cells")] = None
     scale: Annotated[Real, Field(gt=0, description="factor on a mesh file's coordinates")] = 1.0
     translate: Annotated[Vector | None, Field(description="m, applied to a mesh file after scaling")] = None
     cavity: Annotated[Box | None, Field(description="cells of a meshed box with their centre in it are left out")] = (
