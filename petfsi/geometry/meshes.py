@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,12 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
 from petfsi.geometry.groups import cell_groups
+from petfsi.geometry.mesh_files import open_mesh
 from petfsi.geometry.quadratic import EDGES
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, Kind, simplices
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 FLAT = 1e-12
 #: Points coincide within this fraction of the mesh's extent.
 COINCIDENT = 1e-10
+#: Points of surfaces that are this near are one, as a fraction of the extent: files may hold single precision.
+ROUNDED = 1e-7
 
 #: The simplex of each dimension, as meshio calls it.
 SIMPLEX = {1: "line", 2: "triangle", 3: "tetra"}
@@ -202,7 +205,7 @@ def read_surface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points and facets of a closed surface in a file, normals outward. Not collective.
 
-    Points in the same place are merged, as formats such as STL repeat them.
+    Points in the same place to within round-off are merged, as formats such as STL repeat them.
 
     Parameters
     ----------
@@ -220,8 +223,7 @@ def read_surface(
     told: list[str] = [] if notes is None else notes
     points, facets = _read(shape, dim, dim - 1, f"{key}.mesh", directory, told)
     where = f"{key}.mesh = {shape.mesh!r}"
-    points, merged = np.unique(points, axis=0, return_inverse=True)
-    facets = merged.ravel()[facets]
+    points, facets = _merged(points, facets)
     shared = np.sort(facets, axis=1)
     _refuse(where, np.count_nonzero(np.any(np.diff(shared, axis=1) == 0, axis=1)), "facets without extent")
     _refuse(where, np.count_nonzero(occurrences(facets) > 1), "duplicate facets")
@@ -236,24 +238,14 @@ def read_surface(
     return _drop_unused(points, facets if volume > 0 else facets[:, ::-1])
 
 
-def open_mesh(shape: Shape, key: str, directory: Path) -> meshio.Mesh:
-    """Return what meshio reads; whatever a reader does to say no becomes one InputError. Not collective."""
-    import meshio
-
-    path = Path(directory) / str(shape.mesh)
-    if not path.is_file():
-        raise InputError(f"{key} = {shape.mesh!r}: no file {path}")
-    said = io.StringIO()
-    try:
-        # on a broken file some readers print, warn or even exit
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        why = str(error) if isinstance(error, Exception) else ""
-        words = " ".join(f"{why} {said.getvalue()}".split())
-        raise InputError(
-            f"{key} = {shape.mesh!r}: cannot be read as a mesh ({shown(words, 300) or type(error).__name__})"
-        ) from error
+def _merged(points: np.ndarray, facets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of which those in one place are one, and the facets with them."""
+    points, number = np.unique(points, axis=0, return_inverse=True)
+    close = cKDTree(points).query_pairs(ROUNDED * float(np.ptp(points, axis=0).max()), output_type="ndarray")
+    graph = coo_matrix((np.ones(len(close)), (close[:, 0], close[:, 1])), shape=(len(points),) * 2)
+    _, label = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)
+    return points[first], label[number.ravel()][facets]
 
 
 def _read(

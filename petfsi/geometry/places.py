@@ -9,7 +9,8 @@ import numpy as np
 
 from petfsi.errors import InputError
 from petfsi.geometry.groups import cell_groups, point_groups
-from petfsi.geometry.meshes import body_blocks, open_mesh
+from petfsi.geometry.mesh_files import open_mesh
+from petfsi.geometry.meshes import body_blocks
 from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, simplices
