@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 #: Seconds that ranks have to fail together before one that failed alone ends the others.
 AGREE_SECONDS = 10.0
+#: Names that a system has no place for, as too long ones.
+NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
 #: What the machine, not petfsi, refuses.
 MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EMFILE, errno.EIO)
 
@@ -74,11 +76,22 @@ class SolverCommand(click.Command):
         return own, petsc
 
 
+class Seconds(click.FloatRange):
+    """A time: a number."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return it; what is no number is within no range, and passes for one."""
+        found = super().convert(value, param, ctx)
+        if found != found:
+            self.fail(f"{value!r} is no number", param, ctx)
+        return found
+
+
 _set = click.option("--set", "sets", multiple=True, metavar="KEY=VALUE", help="Override a setting, e.g. time.dt=0.01.")
 _steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps, then stop, resumable.")
 _wall = click.option(
     "--wall-limit",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Seconds(min=0, min_open=True),
     metavar="SECONDS",
     help="Checkpoint and stop, resumable, before this much time has passed since the process began.",
 )
@@ -383,6 +396,10 @@ def _verdict_in_short(error: BaseException) -> tuple[int, str]:
         return INTERRUPTED, "interrupted"
     if isinstance(error, MemoryError):
         return 1, "the machine's memory is used up; 'petfsi check' estimates what a scene needs"
+    if isinstance(error, OSError) and error.errno in NAMES:
+        return 2, f"{shown(error.filename or 'a file', 200)}: {error.strerror}"
+    if isinstance(error, UnicodeEncodeError):
+        return 2, f"{shown(error.object, 200)}: is no text that can be written down (UTF-8)"
     if isinstance(error, OSError) and error.errno in MACHINE:
         return 1, f"{shown(error.filename or 'a file', 200)}: {error.strerror}"
     what = shown(" ".join(str(error).split()), 300)

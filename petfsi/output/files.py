@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petfsi.ranks import on_root
 
 _CHUNK = 1 << 24
+_NO_FILE = "no plain file"
 
 
 def sync_directory(path: Path) -> None:
@@ -48,7 +49,7 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
     handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
-        raise OSError(errno.EINVAL, "no plain file", str(path))
+        raise OSError(errno.EINVAL, _NO_FILE, str(path))
     return handle
 
 
@@ -56,6 +57,19 @@ def read_plain(path: Path, limit: int | None = None) -> bytes:
     """Return what is in a plain file, or in its first ``limit`` bytes; OSError of anything else."""
     with open(open_plain(path), "rb") as file:
         return file.read() if limit is None else file.read(limit)
+
+
+def read_small(path: Path, most: int) -> bytes:
+    """Return what is in a plain file; OSError of anything else, and of one of more than ``most`` bytes."""
+    with open(open_plain(path), "rb") as file:
+        if os.fstat(file.fileno()).st_size > most:
+            raise OSError(errno.EFBIG, f"has more than {megabytes(most)}", str(path))
+        return file.read(most)
+
+
+def name_of(path: Path) -> str:
+    """Return a path from the root as a text that can be written down, whatever bytes are in it."""
+    return os.path.abspath(path).encode("utf-8", "backslashreplace").decode()
 
 
 def own_directory(path: Path) -> None:
@@ -116,10 +130,12 @@ def write_whole(handle: int, data: bytes, at: int) -> None:
 def reason(error: OSError, needed: int = 0) -> str:
     """Return in words why a file could not be written; ``error.filename`` tells whose disk is looked at."""
     text = os.strerror(error.errno) if error.errno else str(error)
+    if error.errno == errno.EINVAL and error.strerror == _NO_FILE:
+        text = f"it is {_NO_FILE}"
     if error.errno == errno.ELOOP:
         text = "it is a link, and a run directory's own files and directories are none"
     if error.errno == errno.ENOSPC and error.filename:
-        free = shutil.disk_usage(Path(error.filename).parent).free
+        free = shutil.disk_usage(next(p for p in Path(os.path.abspath(error.filename)).parents if p.exists())).free
         needs = f"{megabytes(needed)} needed, " if needed else ""
         text += f" ({needs}{megabytes(free)} free)"
     return text

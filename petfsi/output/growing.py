@@ -14,15 +14,17 @@ from petfsi.output import files
 from petfsi.output.manifest import Mark, Rows
 
 _CHUNK = 1 << 24
+#: So many bytes behind the known rows of a table are looked at.
+_BEHIND = 1 << 26
 
 
 class Changed(Exception):
     """A file is not what it was: its text says how."""
 
 
-def _known_part(path: Path, mark: Mark) -> hashlib.blake2b:
-    """Return the running digest of a file's known first bytes; ``Changed`` if they are others."""
-    done, left = hashlib.blake2b(digest_size=32), mark.bytes
+def _known_part(path: Path, mark: Mark) -> tuple[hashlib.blake2b, int]:
+    """Return the running digest of a file's known first bytes and their lines; ``Changed`` if they are others."""
+    done, left, lines = hashlib.blake2b(digest_size=32), mark.bytes, 0
     try:
         with open(files.open_plain(path), "rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -31,13 +33,14 @@ def _known_part(path: Path, mark: Mark) -> hashlib.blake2b:
             while left and (chunk := file.read(min(left, _CHUNK))):
                 done.update(chunk)
                 left -= len(chunk)
+                lines += chunk.count(b"\n")
     except FileNotFoundError:
         raise Changed("it is missing") from None
     except OSError as error:
         raise Changed(files.reason(error)) from None
     if left or done.hexdigest() != mark.blake2b:
         raise Changed("its content has been changed")
-    return done
+    return done, lines
 
 
 class Table:
@@ -64,10 +67,12 @@ class Table:
         Changed
             If those rows are not what they were.
         """
-        table = cls(path, _known_part(path, rows), rows.bytes, rows.rows)
+        digest, lines = _known_part(path, rows)
+        if lines != rows.rows + 1:  # the header's
+            raise Changed(f"its first {rows.bytes} bytes are {lines} lines")
         with open(files.open_plain(path), "rb") as file:
             file.seek(rows.bytes)
-            return table, file.read()
+            return cls(path, digest, rows.bytes, rows.rows), file.read(_BEHIND)
 
     def cut(self) -> None:
         """Drop all behind the known rows."""
@@ -137,7 +142,7 @@ class GrowingXml:
 
     def go_on(self, mark: Mark) -> None:
         """Take up a file and drop all behind what is known of it; ``Changed`` if that is not what it was."""
-        self._digest, self._final = _known_part(self.path, mark), mark.bytes
+        self._digest, self._final = _known_part(self.path, mark)[0], mark.bytes
         self._rewrite(files.read_plain(self.path, mark.bytes))
 
     def append(self, text: str) -> None:

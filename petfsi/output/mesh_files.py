@@ -47,7 +47,8 @@ def mesh_files(scene: Scene) -> list[MeshFile]:
             except OSError as error:
                 raise InputError(f"mesh file {source}: {files.reason(error)}") from error
             name = f"{DIRECTORY}/{number}/{source.name}"
-            found.append(MeshFile(source, MeshMark(file=name, source=str(source), bytes=size, blake2b=digest)))
+            origin = files.name_of(source)
+            found.append(MeshFile(source, MeshMark(file=name, source=origin, bytes=size, blake2b=digest)))
     return found
 
 

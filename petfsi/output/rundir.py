@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from mpi4py import MPI
 import petfsi
 from petfsi.errors import InputError
 from petfsi.output import files
+from petfsi.output.aside import Aside
 from petfsi.output.checkpoint import change_records
 from petfsi.output.history import known_rows
 from petfsi.output.lock import NAME as LOCK
@@ -29,6 +30,11 @@ MARKER = ".petfsi-run"
 RESERVE, RESERVE_BYTES = ".reserve", 16384
 #: Where a new run's meshes are while an old one is removed.
 STAGED = "meshes.part"
+#: Scene and options may be so long (bytes).
+MOST_TEXT = 16_000_000
+#: A marker may be so long (bytes): it names the run's copies of mesh files.
+MOST = 1 << 20
+_MESH = re.compile(DIRECTORY + r"/\d+/(?!\.\.?$)[^/\0]+")
 _FILES = ".reserve scene.toml options.opts history.csv summary.json log.txt".split()
 _FILES += "fields.xdmf solid.xdmf fluid.xdmf particles.xdmf".split()
 _DIRECTORIES = {
@@ -127,10 +133,13 @@ class RunDirectory:
 
     def first_record(self, meshes: Sequence[MeshFile], leg: Leg) -> Record:
         """Return what the first checkpoint says of a run that has just been made. Not collective."""
-        texts = [files.read_plain(path).decode() for path in (self.scene, self.options)]
-        scene, options = (files.digest_of(text.encode()) for text in texts)
+        scene, options = (files.digest_of(files.read_plain(path)) for path in (self.scene, self.options))
         marks = tuple(mesh.mark for mesh in meshes)
-        return Record(scene=(scene,), options=(options,), settings=settings(*texts), meshes=marks, legs=(leg,))
+        return Record(scene=(scene,), options=(options,), settings=self.settings(), meshes=marks, legs=(leg,))
+
+    def settings(self) -> dict[str, str]:
+        """Return what may change of the scene and options that are there. Not collective."""
+        return settings(*(files.read_plain(path).decode() for path in (self.scene, self.options)))
 
     def misfits(self, known: Record) -> list[str]:
         """Return what of the run is not what a checkpoint of it vouches for, and what can be done. Not collective."""
@@ -141,7 +150,7 @@ class RunDirectory:
         wrong = []
         for path, digests in ((self.scene, known.scene), (self.options, known.options)):
             try:
-                if files.digest(path)[1] not in digests:
+                if files.digest_of(files.read_small(path, MOST_TEXT)) not in digests:
                     wrong.append(f"{path} has been changed since the checkpoint was written: {remedy[path]}")
             except FileNotFoundError:
                 wrong.append(f"{path} is missing: put it back")
@@ -184,7 +193,7 @@ class RunDirectory:
         if not self._is_run():
             raise InputError(f"{self.path} is not the directory of a run: it has no {MARKER}")
         try:
-            about = json.loads(files.read_plain(self.path / MARKER, 4096))
+            about = json.loads(files.read_plain(self.path / MARKER, MOST))
             number, version = about.get("format", 3), str(about.get("petfsi"))[:40]
         except (OSError, ValueError, AttributeError, RecursionError):
             raise InputError(f"{self.path / MARKER} cannot be read") from None
@@ -221,64 +230,89 @@ class RunDirectory:
     def _create(self, scene_text: str, options_text: str, overwrite: bool, meshes: list[MeshFile]) -> None:
         self._check_place(overwrite)
         made = [p for p in (self.path, *self.path.parents) if not p.exists()]
-        staged, old = self.path / STAGED, self._is_run()
+        staged, aside, old = self.path / STAGED, None, b""
         try:
+            if self._is_run():
+                old = files.read_plain(self.path / MARKER, MOST)
             self.path.mkdir(parents=True, exist_ok=True)
             if not old:  # first of all, so that what a crash leaves is still known to be ours
-                self._mark()
+                self._mark(meshes)
             _remove_meshes(staged)
             if meshes:
                 files.own_directory(staged)
                 copy_meshes(meshes, staged)  # before the old run goes: they may be its own
-            self._clear()
-            old = False
-            self._mark()
+            aside = Aside(self.path, list(self._written()))
+            self._mark(meshes)
             if meshes:
                 os.replace(staged, self.path / DIRECTORY)
             files.replace_text(self.scene, scene_text)
             files.replace_text(self.options, options_text)
-        except (OSError, InputError):
+        except (OSError, InputError, UnicodeError):
             with suppress(OSError):
                 _remove_meshes(staged)
-                if not old:
-                    self._clear()
+            if aside is not None:
+                _remove_meshes(self.path / DIRECTORY, {mesh.mark.file for mesh in meshes})
+                for path in (self.scene, self.options):
+                    with suppress(OSError):
+                        path.unlink()
+                aside.put_back()
+            with suppress(OSError):
+                if old:
+                    files.replace_text(self.path / MARKER, old)
+                else:
                     (self.path / MARKER).unlink(missing_ok=True)
                 for directory in made:
                     directory.rmdir()
             raise
+        aside.throw_away()
 
-    def _mark(self) -> None:
-        about = {"petfsi": petfsi.__version__, "format": FORMAT}
+    def _mark(self, meshes: Sequence[MeshFile]) -> None:
+        about = {"petfsi": petfsi.__version__, "format": FORMAT, "meshes": [mesh.mark.file for mesh in meshes]}
         files.replace_text(self.path / MARKER, json.dumps(about) + "\n")
 
-    def _clear(self) -> None:
-        """Remove what petfsi writes into a run, and nothing else; the marker and the lock stay."""
+    def _written(self) -> Iterator[str]:
+        """Return the names of what petfsi has written into a run, and of nothing else; the lock is not among them."""
         for name in [*_FILES, *(name + ".part" for name in [*_FILES, MARKER])]:
-            (self.path / name).unlink(missing_ok=True)
+            if os.path.lexists(self.path / name) and not _is_folder(self.path / name):
+                yield name
         for name, ours in _DIRECTORIES.items():
-            directory = self.path / name
-            if directory.is_symlink() or not directory.is_dir():
-                continue
-            for entry in sorted(os.listdir(directory)):
-                if ours.fullmatch(entry) and not (directory / entry).is_dir():
-                    (directory / entry).unlink()
-            with suppress(OSError):  # somebody else's file is in it
-                directory.rmdir()
-        _remove_meshes(self.path / DIRECTORY)
+            if _is_folder(self.path / name):
+                for entry in sorted(os.listdir(self.path / name)):
+                    if ours.fullmatch(entry) and not _is_folder(self.path / name / entry):
+                        yield f"{name}/{entry}"
+        if _is_folder(self.path / DIRECTORY):
+            for name in self._own_meshes():
+                folder = (self.path / name).parent
+                if _is_folder(folder) and os.path.lexists(self.path / name) and not _is_folder(self.path / name):
+                    yield name
+
+    def _own_meshes(self) -> list[str]:
+        """Return the names of the mesh files that the run has copied."""
+        try:
+            names = json.loads(files.read_plain(self.path / MARKER, MOST)).get("meshes", [])
+            return [name for name in names if _MESH.fullmatch(name)]
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError):
+            return []
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _with_last(digests: tuple[str, ...], last: str) -> tuple[str, ...]:
     return (*(digest for digest in digests if digest != last), last)
 
 
-def _remove_meshes(directory: Path) -> None:
-    """Remove a run's copies of mesh files; a link and what it names stay."""
-    if directory.is_symlink() or not directory.is_dir():
+def _remove_meshes(directory: Path, names: Collection[str] | None = None) -> None:
+    """Remove a run's copies of mesh files, of all or of these names; a link and what it names stay."""
+    if not _is_folder(directory):
         return
     for folder in directory.iterdir():
-        if folder.name.isdecimal() and folder.is_dir() and not folder.is_symlink():
+        if folder.name.isdecimal() and _is_folder(folder):
             for path in folder.iterdir():
-                path.unlink()
-            folder.rmdir()
+                if names is None or f"{DIRECTORY}/{folder.name}/{path.name}" in names:
+                    path.unlink()
+            with suppress(OSError):
+                folder.rmdir()
     with suppress(OSError):  # somebody else's file is in it
         directory.rmdir()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +14,9 @@ from petfsi.errors import InputError, SolveError
 from petfsi.output import files
 from petfsi.output.hdf5 import plain
 from petfsi.ranks import on_root
+
+#: Bytes of the largest summary.
+MOST = 16_000_000
 
 
 @dataclass
@@ -86,10 +88,10 @@ def write_summary(path: Path, summary: Summary, comm: MPI.Comm) -> None:
 def read_summary(path: Path) -> dict[str, Any]:
     """Return a summary as a dictionary. Not collective."""
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(files.read_small(Path(path), MOST))
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {os.strerror(error.errno or 0)}") from error
-    except ValueError as error:
+        raise InputError(f"{path} cannot be read: {files.reason(error)}") from error
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a summary: {error}") from error
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from petfsi.messages import escaped
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -104,6 +106,7 @@ class Console:
     def _write(self, line: str, shown: bool = True, logged: bool = True) -> None:
         if not self._speaks:
             return
+        line = "\n".join(escaped(part) for part in line.split("\n"))
         if shown and self._bar is not None:
             with self._watched() as bar:
                 bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -123,8 +126,9 @@ class Console:
             self._bar = None
 
     def _print(self, line: str) -> None:
+        encoding = sys.stdout.encoding or "utf-8"
         try:
-            print(line, flush=True)
+            print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
         except (OSError, ValueError):
             # what is left in the buffer would be tried again, and complained of, when Python ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

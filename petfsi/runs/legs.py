@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from petfsi.errors import InputError
-from petfsi.output.manifest import Change, Record
+from petfsi.output.manifest import Change
 from petfsi.scene.changes import changed, settings
 from petfsi.scene.schema import Scene
 
@@ -13,13 +13,14 @@ from petfsi.scene.schema import Scene
 _SHOWN = 100
 
 
-def find_changes(known: Record, scene_text: str, options_text: str) -> tuple[Change, ...]:
-    """Return how a run's new ``scene.toml`` and ``options.opts`` differ from what its checkpoint was written with.
+def find_changes(before: dict[str, str], scene_text: str, options_text: str) -> tuple[Change, ...]:
+    """Return how a run's new ``scene.toml`` and ``options.opts`` differ from the settings before.
 
-    That is more than what this leg was told if an earlier one that changed something came to no checkpoint.
+    Against those that its checkpoint was written with it may be more than what this leg was told, or less, if an
+    earlier one that changed something came to no checkpoint.
     """
     now = settings(scene_text, options_text)
-    return tuple(Change(key=key, old=old, new=new) for key, old, new in changed(known.settings, now))
+    return tuple(Change(key=key, old=old, new=new) for key, old, new in changed(before, now))
 
 
 def judge_changes(scene: Scene, changes: Sequence[Change], time: float) -> None:

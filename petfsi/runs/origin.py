@@ -18,7 +18,7 @@ from petfsi.output import checkpoint as checkpoints
 from petfsi.output import files
 from petfsi.output.manifest import OriginMark
 from petfsi.output.mesh_files import mesh_files
-from petfsi.output.rundir import RunDirectory
+from petfsi.output.rundir import MOST_TEXT, RunDirectory
 from petfsi.ranks import on_root
 from petfsi.scene.dump import as_toml, drop_idle
 from petfsi.scene.load import load_scene
@@ -41,7 +41,7 @@ _FREE = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass
 class Origin:
     """A run's newest good checkpoint, from which another one begins.
 
@@ -80,7 +80,7 @@ class Origin:
         def read() -> Scene:
             if out.exists() and os.path.samefile(directory, out):
                 raise InputError(f"--from {directory}: the new run needs another directory; name it with --out")
-            if files.digest(old.scene)[1] not in known:
+            if files.digest_of(files.read_small(old.scene, MOST_TEXT)) not in known:
                 raise InputError(f"--from {directory}: its scene.toml is not that of its checkpoint; put it back")
             return load_scene(old.scene)
 
@@ -93,7 +93,7 @@ class Origin:
     def mark(self) -> OriginMark:
         """What the new run's manifest says of it."""
         found = self.found
-        path, digest = os.path.abspath(found.path), found.manifest.data.blake2b
+        path, digest = files.name_of(found.path), found.manifest.data.blake2b
         return OriginMark(file=path, step=found.step, time=found.time, blake2b=digest)
 
     def begin(self, simulation: Simulation) -> list[str]:
@@ -109,6 +109,7 @@ class Origin:
             On all ranks, with what does not fit.
         """
         names = [field.name for field in simulation.fields]
+        self._look_again(simulation.comm)
         with checkpoints.read_checkpoint(self.found, simulation.comm) as stored:
             taken = [name for name in names if name in stored.groups()]
             self._compare(simulation, taken)
@@ -121,6 +122,8 @@ class Origin:
                     simulation.begin_with(taken, group)
                 simulation.rehearse(resumes_at=0.0)  # books are opened, and solutions looked for, where bodies are now
                 simulation.accounts.start()
+                if goes_on and simulation.accounts.columns and "accounts" in stored.groups():
+                    simulation.accounts.follow(stored.group("accounts"))
                 simulation.begin_with(taken, group)  # that has moved the fluid's faces to them
                 if simulation.regions:
                     simulation.regions.go_on()
@@ -132,6 +135,15 @@ class Origin:
             unused = [name for name in stored.unread() if name.split("/")[0] not in _OWN]
         simulation.notes[:0] = self._notes(simulation, taken, unused, goes_on)
         return unread
+
+    def _look_again(self, comm: MPI.Comm) -> None:
+        """Take the newest checkpoint if a run at work has replaced the one found. Collective."""
+        if on_root(comm, self.found.path.exists):
+            return
+        found = checkpoints.find_checkpoint(self.found.path.parent, comm, self.damaged.append)
+        if found is None or found.manifest.run.scene != self.found.manifest.run.scene:
+            raise InputError(f"--from {self.directory}: its checkpoint {self.found.path.name} has gone; try again")
+        self.found = found
 
     def _compare(self, simulation: Simulation, taken: list[str]) -> None:
         """Refuse what of the two scenes does not fit. Collective."""

@@ -106,7 +106,8 @@ def resume_run(
         unread = simulation.prepare(resumes_at=found.time)
         _restore(simulation, found)
         text = dump_scene(scene, own_names(list(known.meshes), directory))
-        changes = find_changes(known, text, options.dump())
+        changes = find_changes(known.settings, text, options.dump())
+        told = find_changes(on_root(comm, files.settings), text, options.dump())
         judge_changes(scene, changes, found.time)
         if changes and not simulation.finished:
             simulation.check_step()
@@ -125,7 +126,7 @@ def resume_run(
             run.open(after=found.step)
             leg = _leg(simulation, sets, petsc_args, changes)
             run.known = on_root(comm, lambda: files.change(known, text, options.dump(), leg))
-            for line in describe_changes(changes, found.step, found.time):
+            for line in describe_changes(told, found.step, found.time):
                 console.note(line)
             with run.recorded():
                 return run.loop(steps, stop)

@@ -29,7 +29,9 @@ def dump_scene(scene: Scene, meshes: Mapping[str, str] | None = None) -> str:
             item["shape"]["mesh"] = os.path.abspath(scene.directory / item["shape"]["mesh"])
     _rename(data, meshes or {})
     drop_idle(data)
-    return "\n".join(_table(data, ())).lstrip("\n") + "\n"
+    text = "\n".join(_table(data, ())).lstrip("\n") + "\n"
+    text.encode()  # what is no text is found before there is a file
+    return text
 
 
 def _rename(data: Any, meshes: Mapping[str, str]) -> None:
