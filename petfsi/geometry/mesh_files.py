@@ -92,4 +92,6 @@ def _by_trimesh(path: Path) -> meshio.Mesh:
     import trimesh
 
     surface = trimesh.load_mesh(path, process=False)
+    if not len(surface.faces):  # it reads what is no mesh as one without faces
+        raise ValueError("no faces")
     return meshio.Mesh(np.asarray(surface.vertices), [("triangle", np.asarray(surface.faces))])
