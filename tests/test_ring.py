@@ -35,7 +35,7 @@ def test_an_unknown_tag_is_named_with_those_that_the_file_has(shared_path, where
     annulus(shared_path / "ring.msh", 1, 4)
     item = {"loads": {"pressure": 1.0}, "supports": {"fix": ["x"]}}[where] | {"where": {"tag": "iner"}}
     data = ring(shared_path / "ring.msh", **{where: [item]})
-    with pytest.raises(InputError, match=rf"solids.ring.{where}.0.where.tag = 'iner'.*it has 3, floor, inner$"):
+    with pytest.raises(InputError, match=rf"solids.ring.{where}.0.where.tag = 'iner'.*it has 3, body, floor, inner$"):
         SimplexSolid(COMM, scene_from_dict(data))
 
 
