@@ -220,6 +220,7 @@ def test_history_goes_on_after_a_kill_as_if_nothing_had_happened(tmp_path):
     comm.barrier()
     history = History(path, COLUMNS, comm, known)
     assert read_history(path)["step"].tolist() == [1, 2] and history.on_disk() == known
+    comm.barrier()  # rank 0 writes on without waiting for others to have read
     for step in (3, 4):
         history.append(row(step))
     comm.barrier()
