@@ -182,24 +182,20 @@ class Accounts:
 
     def restore(self, read: Reader) -> None:
         """Take up a state, after ``start``. Collective."""
-
-        def number(name: str) -> float:
-            return float(read(name, (0,), (1,))[0])
-
-        self.values = {name: number(name) for name in self.values}
-        self._initial, self.exchanged = number("initial_energy"), number("exchanged")
-        self._sums[:] = [number(name) for name in SUMMED]
+        self.values = {name: _number(read, name) for name in self.values}
+        self._initial, self.exchanged = _number(read, "initial_energy"), _number(read, "exchanged")
+        self._sums[:] = [_number(read, name) for name in SUMMED]
         self.follow(read)
 
     def follow(self, read: Reader) -> None:
         """Take what the next step reads of the one before, after ``start``; the books stay empty. Collective."""
-
-        def number(name: str) -> float:
-            return float(read(name, (0,), (1,))[0])
-
-        began = number("began") > 0
-        self._power = np.array([number(f"power_{name}") for name in SUMMED]) if began else None
+        began = _number(read, "began") > 0
+        self._power = np.array([_number(read, f"power_{name}") for name in SUMMED]) if began else None
         self._solid.restore(read, began)
+
+
+def _number(read: Reader, name: str) -> float:
+    return float(read(name, (0,), (1,))[0])
 
 
 def _summed(works: Sequence[Work]) -> np.ndarray:

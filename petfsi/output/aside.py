@@ -32,10 +32,10 @@ class Aside:
         except OSError:
             self.put_back()
             raise
-        for folder in sorted({Path(name).parent for name in self._names} - {Path()}, reverse=True):
+        folders = {folder for name in self._names for folder in Path(name).parents} - {Path()}
+        for folder in sorted(folders, reverse=True):  # what is in a folder comes before it
             with suppress(OSError):  # somebody else's file is in it
                 (home / folder).rmdir()
-                (home / folder.parents[0]).rmdir() if folder.parents[0] != Path() else None
 
     def put_back(self) -> None:
         """Give every file its old place again, whatever is there now."""
