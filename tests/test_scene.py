@@ -748,10 +748,37 @@ def test_steps_reach_the_end_and_round_off_adds_none(end, dt, steps):
 
 
 @pytest.mark.parametrize(
+    "end, dt, last",
+    [(1.0, "0.3", [0.3, 0.2, 0.2]), (1.0, "0.4", [0.4, 0.3, 0.3]), (1.5, "1.0", [0.75, 0.75])]
+    + [(2.0, "0.1", [0.1, 0.1, 0.1]), (2.0, "0.3*(1 + t)", [0.3, 0.39, 0.507, 0.4015, 0.4015])]
+    + [(2.0, "0.9 - 0.1*t", [0.9, 0.55, 0.55])],
+)
+def test_the_end_is_met_and_the_last_two_steps_share_what_is_left(end, dt, last):
+    stepping = Stepping(scene_from_dict(layer(f"time.end={end}", f"time.dt={dt}")).time)
+    counted, t, taken = stepping.count(100), 0.0, []
+    while not taken or not stepping.finished(t, taken[-1]):
+        taken.append(stepping.length(t))
+        t = stepping.after(len(taken), t, taken[-1])
+    assert t == pytest.approx(end, rel=1e-14)
+    assert taken[-len(last) :] == pytest.approx(last, rel=1e-9)
+    assert counted == len(taken)
+
+
+def test_a_run_that_is_given_a_later_end_counts_its_steps_from_the_old_one():
+    ended = Stepping(scene_from_dict(layer("time.end=1.0", "time.dt=0.3")).time)
+    t = 0.0
+    for step in range(1, 5):
+        t = ended.after(step, t, ended.length(t))
+    assert ended.stored == (0.3, 4, 1.0)
+    later = Stepping(scene_from_dict(layer("time.end=2.0", "time.dt=0.3")).time)
+    later.go_on(4, t, ended.stored)
+    assert later.after(5, t, later.length(t)) == 1.3 and later.count(0) == 8
+
+
+@pytest.mark.parametrize(
     "dt, steps", [("0.1", 20), ("0.1 + 0*t", 20), ("0.1*(1 + (t >= 1 - 1e-9))", 15), ("0.3 + t", 3)]
 )
 def test_steps_of_any_length_reach_the_end(dt, steps):
-    """The last adds 0.3, 0.6 and 1.2 s."""
     stepping = Stepping(scene_from_dict(layer(f"time.dt={dt}")).time)
     assert stepping.count(100) == steps
     assert stepping.constant == (dt == "0.1")

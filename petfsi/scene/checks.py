@@ -112,7 +112,7 @@ def _time(scene: Scene) -> Problems:
     time = scene.time
     try:
         stepping = Stepping(time)
-        dt = stepping.length(0.0)
+        dt = stepping.wanted(0.0)
     except ExpressionError as error:
         yield Problem("time.dt", time.dt, error.reason, ("time.end",))
         return

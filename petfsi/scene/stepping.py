@@ -22,8 +22,8 @@ UNKNOWN = 1e-6
 class Stepping:
     """The scene's ``time`` at work.
 
-    Steps are taken until the end is reached, or missed by ``SLACK`` of the last one; none whose length the scene gives
-    is shortened, so the last one may reach beyond.
+    Steps are taken until the end is reached, but for ``SLACK`` of the last one. Where whole steps would pass it, the
+    last two share what is left: none is shorter than half of what the scene says.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Stepping:
             If that does not lead to t.
         """
         length, begin, start = stored
-        if not (self.constant and length == self.length(t)):
+        if not (self.constant and length == self.wanted(t)):
             self._origin = step, t
         elif abs(start + (step - begin) * length - t) <= SLACK * length:
             self._origin = begin, start
@@ -65,7 +65,7 @@ class Stepping:
     @property
     def stored(self) -> tuple[float, int, float]:
         """The length of equal steps (s) and from which step and time (s) they are counted; zeros of other steps."""
-        return (self.length(self._origin[1]), *self._origin) if self.constant else (0.0, 0, 0.0)
+        return (self.wanted(self._origin[1]), *self._origin) if self.constant else (0.0, 0, 0.0)
 
     def length(self, t: float, stable: float | None = None) -> float:
         """Return the length of the step that begins at t, s.
@@ -81,10 +81,14 @@ class Stepping:
         ExpressionError
             If it is not finite, zero, negative, or no more than round-off.
         """
-        if self._length is not None:
-            return self._length
         if self.auto and stable is not None:
             return self._free_length(t, PART * stable)
+        return self._ending(t, self.wanted(t))
+
+    def wanted(self, t: float) -> float:
+        """Return what the scene says of the length of a step that begins at t, s; raises what ``length`` does."""
+        if self._length is not None:
+            return self._length
         dt = float(self._dt(t=t))
         if dt > (0.0 if self.constant else SHORTEST * self.end):
             self._length = dt if self.constant else None
@@ -98,16 +102,27 @@ class Stepping:
         if not longest > SHORTEST * self.end:
             at = f"the stable step is {longest / PART:.3g} s at t = {t:g}; nine tenths of it "
             raise ExpressionError(f'time.dt = "{AUTO}"', f"{at}must be greater than {SHORTEST:g} of time.end")
+        return self._ending(t, longest)
+
+    def _ending(self, t: float, dt: float) -> float:
+        """Return dt, or what lets the run end at its end where that is nearer than two of them."""
         left = self.end - t
-        if left <= longest:
-            return left
-        return min(longest, left / 2)
+        if left <= 0 or left >= (2 - SLACK) * dt or abs(left - dt) <= SLACK * dt and not self.auto:
+            return dt  # beyond the end a run is done, and the next step is that of one that goes on
+        return left if left <= dt else left / 2
 
     def after(self, step: int, t: float, dt: float) -> float:
         """Return the time after a step of length dt that began at t and ends as number ``step``, s."""
-        # a multiple has one rounding, a sum as many as terms
         begin, start = self._origin
-        return start + (step - begin) * dt if self.constant else t + dt
+        if self.constant and dt == self._length:  # a multiple has one rounding, a sum as many as terms
+            return start + (step - begin) * dt
+        end = self._sum(t, dt)
+        if self.constant:  # the steps of a run that is given a later end are counted from here
+            self._origin = step, end
+        return end
+
+    def _sum(self, t: float, dt: float) -> float:
+        return self.end if abs(t + dt - self.end) <= SLACK * dt else t + dt
 
     def finished(self, t: float, dt: float) -> bool:
         """Say whether t, reached by a step of length dt, is the end."""
@@ -119,14 +134,15 @@ class Stepping:
         if self.auto:
             return None
         try:
-            dt = self.length(t)
             if self.constant:
+                dt = self.wanted(t)
                 return begin + max(1, math.ceil((self.end - start) / dt - SLACK))
+            dt = self.length(t)
             while step == begin or not self.finished(t, dt):
                 if step == begin + most:
                     return None
                 dt = self.length(t)
-                step, t = step + 1, self.after(step + 1, t, dt)
+                step, t = step + 1, self._sum(t, dt)
         except ExpressionError:
             return None
         return step
