@@ -11,7 +11,6 @@ from mpi4py import MPI
 
 from petfsi import __version__
 from petfsi.errors import InputError
-from petfsi.messages import shown
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.lock import held, refuse_if_held
 from petfsi.output.manifest import Change, Leg, OriginMark
@@ -26,6 +25,7 @@ from petfsi.runs.plan import MAX_COUNTED, mesh_notes
 from petfsi.runs.ready import made_ready
 from petfsi.runs.running import DONE, Run
 from petfsi.runs.stop import Stop
+from petfsi.runs.story import beginning
 from petfsi.scene.changes import RESUMABLE
 from petfsi.scene.load import dump_scene, load_scene
 from petfsi.scene.schema import Scene
@@ -66,7 +66,7 @@ def run_scene(
         leg = _leg(simulation, sets, petsc_args, origin=None if origin is None else origin.mark)
         known = on_root(comm, lambda: files.first_record(meshes, leg))
         with Console(comm.rank, files.log, total=_total(simulation, steps)) as console:
-            _greet(console, simulation, options, unread)
+            _greet(console, simulation, options, unread, files)
             run = Run(simulation, files, console, known, lock)
             with run.recorded():
                 run.open()
@@ -120,7 +120,7 @@ def resume_run(
                 return DONE
             for line in damaged:
                 console.warn(line)
-            _greet(console, simulation, options, unread)
+            _greet(console, simulation, options, unread, files)
             console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
             run = Run(simulation, files, console, known, lock)
             run.open(after=found.step)
@@ -172,10 +172,9 @@ def _total(simulation: Simulation, steps: int | None) -> int | None:
     return min(known, default=None)
 
 
-def _greet(console: Console, simulation: Simulation, options: Options, unread: list[str]) -> None:
-    size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
-    title = shown(simulation.scene.title, 200) or "untitled"
-    console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
+def _greet(console: Console, simulation: Simulation, options: Options, unread: list[str], files: RunDirectory) -> None:
+    for line in beginning(simulation, options, files):
+        console.note(line)
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
     told.append(on_root(simulation.comm, lambda: mesh_notes(simulation.scene)) if simulation.step == 0 else [])
     for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:

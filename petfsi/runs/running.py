@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import platform
 import re
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
-import numpy as np
 from mpi4py import MPI
 
-from petfsi import __version__, petsc
+from petfsi import __version__
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.base import Slab
 from petfsi.output import checkpoint as checkpoints
@@ -28,6 +26,7 @@ from petfsi.runs.effort import Effort, earlier_effort, summed
 from petfsi.runs.kept import Kept
 from petfsi.runs.plan import skipped
 from petfsi.runs.stop import Stop
+from petfsi.runs.story import ending, versions
 from petfsi.simulation import Simulation
 
 DONE, STOPPED = 0, 75
@@ -83,10 +82,12 @@ class Run:
         except BaseException as error:
             if first:
                 self.files.free_reserve()
+                summary = self.summary("failed", str(error).split("\n")[0])
                 with suppress(OSError, SolveError):  # what has failed already is the message, not this
-                    why = str(error).split("\n")[0]
-                    write_summary(self.files.summary, self.summary("failed", why), MPI.COMM_SELF)
+                    write_summary(self.files.summary, summary, MPI.COMM_SELF)
                 self.console.log(f"failed: {error}")
+                with suppress(OSError):
+                    self.tell(self.console.log, summary)
             raise
         finally:
             if first:
@@ -118,7 +119,9 @@ class Run:
         step = self.simulation.step
         if self._saved != step:
             self.checkpoint()
-        self.summarise(status, why)
+        summary = self.summary(status, why)
+        write_summary(self.files.summary, summary, self.comm)
+        self.tell(self.console.note, summary)
         if status == "done":
             return DONE
         self.console.note(f"stopped by {why} after step {step}; go on with: petfsi resume {self.files.path}")
@@ -255,9 +258,11 @@ class Run:
         largest = {"volume_error": self.effort.volume_error} if of_pressure else {}
         return largest | simulation.accounts.values
 
-    def summarise(self, status: Status, why: str) -> None:
-        """Write summary.json. Collective."""
-        write_summary(self.files.summary, self.summary(status, why), self.comm)
+    def tell(self, say: Callable[[str], None], summary: Summary) -> None:
+        """Say what the run was so far, and where things are. Not collective."""
+        if self.comm.rank == 0:
+            for line in ending(summary, self.files, clock.perf_counter() - self._begin):
+                say(line)
 
     def summary(self, status: Status, why: str) -> Summary:
         """Return what the run was so far. Not collective."""
@@ -285,13 +290,3 @@ def _grid_info(simulation: Simulation) -> GridInfo | None:
     if grid is None:
         return None
     return GridInfo(tuple(map(float, grid.origin)), tuple(map(float, grid.dx)), tuple(grid.cells[: grid.dim]))
-
-
-def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
-    return {
-        "petfsi": __version__,
-        "python": platform.python_version(),
-        "petsc": ".".join(map(str, petsc.PETSc.Sys.getVersion())),
-        "numpy": np.__version__,
-    }
