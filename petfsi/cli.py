@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from petfsi import __version__
-from petfsi.errors import PetfsiError
+from petfsi.errors import PetfsiError, is_memory
 from petfsi.messages import screen, shown
 from petfsi.runs.console import open_streams
 
@@ -394,7 +394,7 @@ def _verdict_in_short(error: BaseException) -> tuple[int, str]:
         return error.exit_code, screen(str(error), first=len("petfsi: "))
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"
-    if isinstance(error, MemoryError):
+    if is_memory(error):
         return 1, "the machine's memory is used up; 'petfsi check' estimates what a scene needs"
     if isinstance(error, OSError) and error.errno in NAMES:
         return 2, f"{shown(error.filename or 'a file', 200)}: {error.strerror}"

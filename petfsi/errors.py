@@ -1,5 +1,8 @@
 """The errors a user meets, each with the exit code it ends in."""
 
+#: PETSc's code of a machine without memory.
+_PETSC_MEMORY = 55
+
 
 class PetfsiError(Exception):
     """Something a user can act on; its text stands alone, without a traceback."""
@@ -33,3 +36,8 @@ class TouchError(FinalError):
 
 class NoSolutionError(FinalError):
     """The equations of a step have no solution, whatever its length."""
+
+
+def is_memory(error: BaseException) -> bool:
+    """Return whether what Python or PETSc raises says that the machine has no memory left."""
+    return isinstance(error, MemoryError) or getattr(error, "ierr", 0) == _PETSC_MEMORY

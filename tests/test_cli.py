@@ -158,6 +158,12 @@ def test_click_tells_the_same_exit_code(scene, calls):
 # ---- how commands end ---------------------------------------------------------------------------------------
 
 
+class NoMemoryInPetsc(RuntimeError):
+    """As PETSc's own error says that it could not allocate."""
+
+    ierr = 55
+
+
 @pytest.mark.parametrize(
     "error, code, said",
     [
@@ -165,6 +171,7 @@ def test_click_tells_the_same_exit_code(scene, calls):
         (SolveError("step 3: DIVERGED"), 3, "petfsi: step 3: DIVERGED\n"),
         (KeyboardInterrupt(), 130, "petfsi: interrupted\n"),
         (MemoryError(), 1, "'petfsi check' estimates what a scene needs"),
+        (NoMemoryInPetsc(), 1, "'petfsi check' estimates what a scene needs"),
         (OSError(28, "No space left on device", "history.csv"), 1, "petfsi: history.csv: No space left on device\n"),
         (ZeroDivisionError("division\nby zero"), 1, "ZeroDivisionError: division by zero (at petfsi/cli.py:"),
         (RuntimeError("x" * 1000), 1, "this is a defect in petfsi; set PETFSI_TRACEBACK=1"),

@@ -1,13 +1,14 @@
 """Solvers that Python's collector finds on each rank at a time of its own."""
 
 import gc
+from weakref import ref
 
 import pytest
 from mpi4py import MPI
 from step_cases import block
 
 from petfsi import releases
-from petfsi.bench.case import only_options
+from petfsi.bench.case import job, only_options
 from petfsi.simulation import Simulation
 
 COMM = MPI.COMM_WORLD
@@ -56,3 +57,21 @@ def test_a_rank_that_collects_a_solver_before_the_others_waits_for_nobody():
             assert len(held._held) < before
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("newton", [[], ["-fsi_snes_type", "newtonls"]], ids=["once", "newton"])
+def test_a_coupled_simulation_is_let_go_with_all_that_petsc_holds_of_it(newton):
+    held = releases.of(MPI.COMM_SELF)
+    gc.collect()
+    held.sweep(MPI.COMM_SELF)
+    before = len(held._held)
+    with only_options(["-options_file", "monolithic.opts", *newton]):
+        sim = Simulation(MPI.COMM_SELF, job(MPI.COMM_SELF, "column", {"fluid.cells": [8, 16]}))
+        sim.prepare()
+        sim.advance()
+        seen = [ref(sim), ref(sim.solver)]
+        assert len(held._held) > before
+        del sim
+        gc.collect()
+        held.sweep(MPI.COMM_SELF)
+    assert [thing() for thing in seen] == [None, None] and len(held._held) == before

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.errors import InputError, SolveError
+from petfsi.errors import InputError, SolveError, is_memory
 from petfsi.solving.system import System, blown_up
 
 #: Linearise once, or iterate.
@@ -148,6 +148,8 @@ class Newton:
             snes.solve(None, self._x)
             self._become(self._x)
         except PETSc.Error as error:
+            if is_memory(error):
+                raise
             raise SolveError(f"solver '{snes.getOptionsPrefix()}snes_' broke down: code {error.ierr}") from None
         finally:
             # it knows the simulation: what is in a circle is let go of at another time on each rank

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import proxy
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc, releases
-from petfsi.errors import InputError, SolveError
+from petfsi.errors import InputError, SolveError, is_memory
 from petfsi.fields.base import PressureFluid
 from petfsi.ranks import on_root
 from petfsi.solving import option_database, options
@@ -110,6 +111,15 @@ class Outcome:
         return Outcome(self.iterations + other.iterations, residual, self.newton + other.newton)
 
 
+class _Iterations:
+    """Counts the iterations of inner solvers. PETSc holds it, and through it nothing else: a solver can be let go."""
+
+    number = 0
+
+    def __call__(self, _ksp: PETSc.KSP, iteration: int, _norm: float) -> None:
+        self.number += iteration > 0
+
+
 class Solver:
     """One KSP on the system's operator.
 
@@ -165,7 +175,7 @@ class Solver:
         self._hierarchy: Hierarchy | None = None
         self._newton: Newton | None = None
         self._correction: tuple[PETSc.Vec, PETSc.Vec] | None = None
-        self._inner_iterations = 0
+        self._inner = _Iterations()
 
     def set_up(self) -> None:
         """Create the KSP if there is none and let everything inside it read its options. Collective."""
@@ -179,12 +189,14 @@ class Solver:
             elif self.converts:
                 self._ksp.setOperators(self._convert())
             elif self._pressure is not None:
-                self._pressure.refresh(self._inner_iterations)
+                self._pressure.refresh(self._inner.number)
             self._ksp.setUp()
             if self._pressure is not None and self._sub_solvers(self._ksp):
                 fluid = self._pressure.fluid
                 self._pressure.settle(self._sub_solvers(self._ksp)[-1], self._grids(fluid))
         except PETSc.Error as error:
+            if is_memory(error):
+                raise
             raise InputError(option_story(self.prefix, error)) from None
 
     def _create(self) -> PETSc.KSP:
@@ -203,7 +215,7 @@ class Solver:
         ksp.setUp()
         for sub in self._sub_solvers(ksp):
             if sub.getType() != PETSc.KSP.Type.PREONLY:
-                sub.setMonitor(self._count)
+                sub.setMonitor(self._inner)
         return ksp
 
     def _grids(self, fluid: Any) -> Hierarchy | None:
@@ -219,9 +231,6 @@ class Solver:
             self._monolith.destroy()  # its pattern may have changed
         self._monolith = self.system.operator.convert("aij", PETSc.Mat())
         return self._monolith
-
-    def _count(self, _ksp: PETSc.KSP, iteration: int, _norm: float) -> None:
-        self._inner_iterations += iteration > 0
 
     @staticmethod
     def _sub_solvers(ksp: PETSc.KSP) -> list[PETSc.KSP]:
@@ -240,7 +249,7 @@ class Solver:
             self._release()
             self._ksp = self._pressure = None
         if self._newton is not None:
-            self._newton.release()
+            self._release_newton()
             self._newton = None
 
     def adopt(self, system: System) -> None:
@@ -288,7 +297,7 @@ class Solver:
         if self.iterates:
             newton, iterations, residual = self._iteration().solve(True, restage)
             return Outcome(iterations, residual, newton)
-        system, ksp, kept = self.system, self._ksp, self._inner_iterations
+        system, ksp, kept = self.system, self._ksp, self._inner.number
         assert ksp is not None
         norms = system.update_residual()
         if self._correction is None:
@@ -304,7 +313,7 @@ class Solver:
             ksp.setTolerances(rtol=rtol)
             ksp.setInitialGuessNonzero(warm)
         # what the preconditioner is judged by is a whole solve
-        self._inner_iterations = kept
+        self._inner.number = kept
         system.solution.axpy(1.0, y)
         return Outcome(iterations, self._relative(system.update_residual()))
 
@@ -322,7 +331,10 @@ class Solver:
 
     def _iteration(self) -> Newton:
         if self._newton is None:
-            self._newton = Newton(self.system, self, PREFIX, STATICS if self._static else DYNAMICS)
+            # what PETSc runs in Python holds the iteration: were that to hold this, neither would ever be let go
+            newton = Newton(self.system, proxy(self), PREFIX, STATICS if self._static else DYNAMICS)
+            self._newton = newton
+            self._release_newton = releases.of(self.system.comm).add(self, newton.release)
         return self._newton
 
     def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec, slack: float = SLACK) -> tuple[int, dict[str, float]]:
@@ -366,7 +378,7 @@ class Solver:
             if warm and ksp.getConvergedReason() > 0 and norms[""] > max(rtol * size, floor):
                 # what iterations update drifts from the true residual by round-off: they go on from there
                 iterations += self._run(b, x)
-                self._inner_iterations = iterations
+                self._inner.number = iterations
                 norms = system.update_residual(x, b)
             lost = system.round_off_at(x)
         self._judge(ksp, norms, slack, floor, lost)
@@ -390,12 +402,14 @@ class Solver:
     def _run(self, b: PETSc.Vec, x: PETSc.Vec) -> int:
         """Run the solver; return its iterations, of the inner one if that takes more. Collective."""
         assert self._ksp is not None
-        self._inner_iterations = 0
+        self._inner.number = 0
         try:
             self._ksp.solve(b, x)
         except PETSc.Error as error:
+            if is_memory(error):
+                raise
             raise SolveError(f"solver '{self.prefix}' broke down: {petsc_text(error)}") from None
-        return max(self._inner_iterations, self._ksp.getIterationNumber())
+        return max(self._inner.number, self._ksp.getIterationNumber())
 
     def _judge(self, ksp: PETSc.KSP, norms: dict[str, float], slack: float, floor: float, lost: float) -> None:
         """Raise unless the solve can be trusted: PETSc's word is not enough when an inner solver gave up."""
@@ -451,6 +465,8 @@ class Solver:
             if option_database.in_force().given:
                 self._try()
         except PETSc.Error as error:
+            if is_memory(error):
+                raise
             raise InputError(option_story(self.prefix, error)) from None
         self._refuse_unread()
         return self._unused()
