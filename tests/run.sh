@@ -14,6 +14,7 @@ bash jobs/setup.sh
 export OMPI_MCA_mpi_yield_when_idle=1
 # many processes are started: each module is compiled once
 unset PYTHONDONTWRITEBYTECODE
+bash tests/compile.sh
 # a process per core; who has nothing left takes tests from the others (5: of those asked for none is there)
 .venv/bin/python -m pytest -q -n auto --dist worksteal --durations=10 -m "not launches" "$@" || [ $? = 5 ]
 echo "== processes of several ranks"
