@@ -285,6 +285,16 @@ def test_the_plan_says_which_options_apply():
     assert "options:     split.opts; over it -fsi_ksp_rtol 1e-6 -log_view\n" in text
 
 
+def test_a_quick_check_prints_the_plan_and_takes_no_heavy_import():
+    scene = Path(__file__).parents[1] / "jobs" / "column.toml"
+    words = ["check", "--quick", str(scene)]
+    code = f"import sys; from petfsi import cli; cli.main({words!r}); print(sorted(sys.modules))"
+    plan, modules = petfsi(code=code).stdout.rsplit("\n", 2)[:2]
+    assert "first step:  not made ready here: run judges it before it writes anything\n" in plan
+    for name in ("'petsc4py'", "'mpi4py'", "'numba'", "'matplotlib'", "'scipy'"):
+        assert name not in modules
+
+
 @pytest.mark.parametrize("where", ["left", {"box": {"origin": [-1.0] * 3, "size": [1.1, 9.0, 9.0]}}])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_plan_counts_the_middle_nodes_of_quadratic_elements(dim, where):

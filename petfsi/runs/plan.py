@@ -36,7 +36,7 @@ PACKAGES = (
 ).split()
 
 
-def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
+def describe_plan(scene: Scene, petsc_options: Sequence[str] = (), quick: bool = False) -> str:
     """Return what a run of the scene would do, for people. Not collective; reads the scene's meshes.
 
     Parameters
@@ -45,6 +45,8 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
         A valid scene.
     petsc_options : sequence of str
         PETSc options as on the command line.
+    quick : bool
+        Whether the first step will not be made ready.
 
     Raises
     ------
@@ -61,8 +63,9 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = ()) -> str:
     lines = [shown(scene.title, 200) or "untitled", ""]
     lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, nodes, cells)]
     lines += [f"{'note:':<13}{note}" for note in mesh_notes(scene)]
-    if not is_rehearsed(scene):
-        lines.append(f"{'first step:':<13}too large to be made ready here: run judges it before it writes anything")
+    if quick or not is_rehearsed(scene):
+        why = "not made ready here" if quick else "too large to be made ready here"
+        lines.append(f"{'first step:':<13}{why}: run judges it before it writes anything")
     lines += [f"{'options:':<13}{_options(scene, nodes, petsc_options)}", "", "skipped:"]
     return "\n".join([*lines, *(f"  {line}" for line in skipped(scene))])
 
