@@ -10,7 +10,6 @@ from mpi4py import MPI
 from petfsi.couplings.base import Coupling
 from petfsi.fields.base import Field, Reader, Slab, SolidField, Work, scalar_slab
 from petfsi.force_work import ForceWork
-from petfsi.integrators import INTEGRATORS
 from petfsi.scene.schema import Scene
 from petfsi.solving.regions import ClosedRegions
 
@@ -90,9 +89,9 @@ class Accounts:
         self._loaded = any(solid.loads or solid.body_force for solid in scene.solids.values())
         self._initial, self.exchanged = 0.0, 0.0
         self._sums = np.zeros(4)
-        integrator = INTEGRATORS[scene.time.integrator]()
-        self._solid = ForceWork(next((f for f in fields if isinstance(f, SolidField)), None), couplings, integrator)
-        self._centred = 0.0 < integrator.moment(1.0) < 1.0
+        scheme = scene.time.scheme
+        self._solid = ForceWork(next((f for f in fields if isinstance(f, SolidField)), None), couplings, scheme)
+        self._centred = 0.0 < scheme.moment(1.0) < 1.0
         self._power: np.ndarray | None = None  # of the step before
         self.values: dict[str, float] = {}
 

@@ -9,7 +9,7 @@ import numpy as np
 from petfsi.couplings.base import Coupling
 from petfsi.errors import NotStoredError
 from petfsi.fields.base import Forces, Reader, Slab, SolidField
-from petfsi.integrators import Integrator
+from petfsi.integrators.base import Integrator
 
 
 class ForceWork:

@@ -15,6 +15,13 @@ COUPLINGS = {
     "pressure": "petfsi.couplings.particles:PressureTransfer",
     "repulsion": "petfsi.couplings.repulsion:RepulsionTransfer",
 }
+INTEGRATORS = {
+    "newmark": "petfsi.integrators.newmark:Newmark",
+    "bdf2": "petfsi.integrators.bdf2:Bdf2",
+    "midpoint": "petfsi.integrators.midpoint:Midpoint",
+    "symplectic-euler": "petfsi.integrators.symplectic:SymplecticEuler",
+    "static": "petfsi.integrators.static:Static",
+}
 MATERIALS = {
     "green": "petfsi.fields.solid.materials.green:green",
     "neohookean": "petfsi.fields.solid.materials.neohookean:neohookean",

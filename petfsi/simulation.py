@@ -105,7 +105,7 @@ class Simulation:
     def _make_solver(self) -> Solver | DiagonalSolver:
         if all(field.diagonal for field in self.system.fields) and len(self.system.fields) < 2:
             return DiagonalSolver(self.system)
-        return Solver(self.system, static=self.scene.time.integrator == "static")
+        return Solver(self.system, static=not self.scene.time.scheme.inertia)
 
     @property
     def divides(self) -> bool:

@@ -9,7 +9,7 @@ from solid_cases import gathered
 from petfsi.bench.case import only_options
 from petfsi.errors import InputError
 from petfsi.fields.solid import SimplexSolid
-from petfsi.integrators import Stage
+from petfsi.integrators.base import Stage
 from petfsi.scene.load import scene_from_dict
 from petfsi.simulation import Simulation
 

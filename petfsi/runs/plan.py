@@ -107,10 +107,10 @@ def skipped(scene: Scene) -> list[str]:
         alone = "; the pressure's block alone is solved" if scene.fluid and scene.fluid.kind != "sph" else ""
         out.append(f"solid, nest and coupling: the scene has no [solids]{alone}")
     out += fluid_skipped(scene)
-    if scene.time.integrator == "symplectic-euler" and scene.fluid is None:
+    if scene.time.scheme.explicit and scene.fluid is None:
         out.append("solver: the mass is lumped, A is diagonal; no option under -fsi_ is read")
-    if scene.time.integrator == "static":
-        out.append("inertia: the integrator is static")
+    if not scene.time.scheme.inertia:
+        out.append(f"inertia: the integrator is {scene.time.integrator}")
     if scene.solids and not any(solid.loads or solid.body_force for solid in scene.solids.values()):
         out.append("loads: there are none")
     if scene.gravity is None:

@@ -116,7 +116,7 @@ def _time(scene: Scene) -> Problems:
     except ExpressionError as error:
         yield Problem("time.dt", time.dt, error.reason, ("time.end",))
         return
-    explicit = time.integrator == "symplectic-euler" or (scene.fluid is not None and scene.fluid.kind == "sph")
+    explicit = time.scheme.explicit or (scene.fluid is not None and scene.fluid.kind == "sph")
     if stepping.auto and not explicit:
         allowed = "is the stable step of what is explicit, particles or symplectic-euler; give a length (s)"
         yield Problem("time.dt", time.dt, allowed, ("time.integrator", "fluid.kind"))
@@ -129,7 +129,7 @@ def _time(scene: Scene) -> Problems:
 
 def _static(scene: Scene) -> Problems:
     """Refuse what has no meaning where nothing moves by itself."""
-    if scene.time.integrator != "static":
+    if scene.time.scheme.inertia:
         return
     uses = ("time.integrator",)
     if scene.fluid is not None:

@@ -33,7 +33,7 @@ def why_explicit(scene: Scene) -> tuple[str, str] | None:
     assert isinstance(scene.fluid, SphFluid)
     if scene.fluid.viscosity == 0:
         return "there is none to solve for", "fluid.viscosity"
-    if scene.solids and scene.time.integrator == "symplectic-euler":
+    if scene.solids and scene.time.scheme.explicit:
         return "symplectic-euler solves for nothing", "time.integrator"
     if scene.solids and scene.transfer == "repulsion":
         return "repulsion has no drag to solve for", "coupling.transfer"

@@ -212,7 +212,7 @@ def _speeds(scene: Scene) -> Problems:
     whole, dt = _extent(scene), _constant(scene.time.dt)
     if whole is None:
         return
-    static = scene.time.integrator == "static"
+    static = not scene.time.scheme.inertia
     for key, name, value in _leaves(scene, ""):
         step, unit = _step(key, name, None if static else dt)
         if step is not None and abs(value) * step > SCENES * whole:

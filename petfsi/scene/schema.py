@@ -7,15 +7,17 @@ is its unit or a few words on what is meant, and ends up in error messages.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, PrivateAttr, Tag, field_validator
 from pydantic_core import PydanticCustomError
 
-from petfsi.integrators import INTEGRATORS
-from petfsi.registry import COUPLINGS, MATERIALS
+from petfsi.registry import COUPLINGS, INTEGRATORS, MATERIALS
 from petfsi.scene.fluids import Fluid
 from petfsi.scene.tables import Flag, Number, Real, Shape, Table, Vector, Whole, one_of
+
+if TYPE_CHECKING:
+    from petfsi.integrators.base import Integrator
 
 Component = Literal["x", "y", "z", "angle"]
 Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
@@ -32,6 +34,13 @@ class Time(Table):
     ] = "refuse"
     retries: Annotated[Whole, Field(ge=0, le=20, description="how often a step that fails is halved")] = 3
     energy_limit: Annotated[Real, Field(description="part of its energy that may come out of nothing; -1: any")] = 1.0
+
+    @property
+    def scheme(self) -> Integrator:
+        """The integrator itself."""
+        from petfsi.integrators.base import integrator  # NumPy, of which who reads a scene has no need
+
+        return integrator(self.integrator)
 
     @field_validator("energy_limit")
     @classmethod
@@ -222,7 +231,7 @@ class Scene(Table):
         """Why nothing can be said of energy out of nothing; empty if something can."""
         if not self.output.accounts:
             return "output.accounts is false"
-        return "the integrator is static" if self.time.integrator == "static" else ""
+        return "" if self.time.scheme.inertia else f"the integrator is {self.time.integrator}"
 
     @property
     def directory(self) -> Path:

@@ -16,7 +16,7 @@ from petfsi.fields.mac.carrying import advect
 from petfsi.fields.mac.carrying.extrapolate import FAR, Band
 from petfsi.fields.mac.carrying.lineage import Lineage
 from petfsi.fields.mac.carrying.sheets import Sheets
-from petfsi.fields.mac.carrying.transport import TRANSPORTS, Advection
+from petfsi.fields.mac.carrying.transport import Advection, transport
 from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces, each
 from petfsi.fields.mac.grid.marks import beside
@@ -73,7 +73,8 @@ class MacFluid(CoveredGrid):
         super().__init__(comm, scene)
         grid, fluid = self.grid, scene.fluid
         assert isinstance(fluid, fluids.MacFluid)
-        self._transport = TRANSPORTS[scene.time.integrator](Advection(grid, self.surroundings, fluid.advection))
+        advection = Advection(grid, self.surroundings, fluid.advection)
+        self._transport = transport(scene.time.scheme, advection)
         self.velocity = Faces(grid.zeros_faces(axis) for axis in self._axes)
         self.velocity_star = Faces(grid.zeros_faces(axis) for axis in self._axes)
         self.boundary_velocity = [grid.zeros_faces(axis) for axis in self._axes]

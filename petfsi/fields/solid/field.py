@@ -28,7 +28,7 @@ from petfsi.fields.solid.turning import Turning, bodies_of
 from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
-from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, relinearised, stable_step
+from petfsi.integrators.base import Motion, Stage, moved, relinearised
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression, ExpressionError
@@ -85,9 +85,9 @@ class NodalSolid(SolidField):
         self.width = len(components)
         self.names = list(solids)
         self.extent = float(np.ptp(mesh.points, axis=0).max())
-        self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
+        self._integrator = scene.time.scheme
         self.explicit = self.diagonal = self._integrator.explicit
-        self._has_inertia = bool(np.isfinite(self._integrator.factor(1.0, 0.0)))
+        self._has_inertia = self._integrator.inertia
         if self.explicit:
             solids = {name: solid.model_copy(update={"mass": "lumped"}) for name, solid in solids.items()}
         self._node_body = np.empty(len(mesh.points), dtype=np.int32)
@@ -110,7 +110,7 @@ class NodalSolid(SolidField):
         self.is_linear = self._elements.constant and not (self._loads is not None and self._loads.follow)
         self._set_exchange(mesh)
         # where there is no inertia, what nothing holds is looked for
-        self._whole = None if np.isfinite(self._integrator.factor(1.0, 0.0)) else mesh
+        self._whole = None if self._has_inertia else mesh
         self._set_motion(mesh, solids, Stepping(scene.time).length(0.0))
         self._set_turning(mesh)
 
@@ -437,7 +437,7 @@ class NodalSolid(SolidField):
         start = np.sin(1.0 + np.arange(len(self._number) * self.width) ** 2).reshape(-1, self.width)
         start = np.where(free, start[self._mesh.natural[: self._mesh.n_owned]], 0.0)
         eigenvalue = largest_eigenvalue(self.comm, stiffness, self._lumped.mass, start)
-        return stable_step(eigenvalue, float(self._damping[:, 1].max()))
+        return self._integrator.stable_step(eigenvalue, float(self._damping[:, 1].max()))
 
     def stretch(self) -> float:
         """Return the largest change of an edge over its length since the last ``stable_step``. Collective."""

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.geometry.places import Tags, located
-from petfsi.integrators import Integrator, Motion, Stage
+from petfsi.integrators.base import Integrator, Motion, Stage
 from petfsi.petsc import Layout
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Solid

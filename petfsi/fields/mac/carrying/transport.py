@@ -17,14 +17,22 @@ from petfsi.fields.mac.carrying.advection import Advection
 from petfsi.fields.mac.carrying.paths import Path
 from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces, each
-from petfsi.integrators import Bdf2, Midpoint, Newmark
+from petfsi.integrators.base import Integrator
+from petfsi.integrators.bdf2 import Bdf2
+from petfsi.integrators.midpoint import Midpoint
+from petfsi.integrators.newmark import Newmark
 
 #: Fills ghosts, and faces without a velocity of their own; returns what is to be read of the arrays. Collective.
 Extend = Callable[[Faces], Faces]
 
 
 class Transport:
-    """First order, for Newmark's and the symplectic scheme:  v*(x) = v^n(x_d), where x_d comes to x along v^n.
+    """First order, for every scheme that has none of its own:  v*(x) = v^n(x_d), where x_d comes to x along v^n.
+
+    Parameters
+    ----------
+    advection : Advection
+    integrator : Integrator
 
     Attributes
     ----------
@@ -39,8 +47,8 @@ class Transport:
 
     names: tuple[str, ...] = ()
 
-    def __init__(self, advection: Advection) -> None:
-        self.integrator: Newmark | Bdf2 | Midpoint = Newmark()
+    def __init__(self, advection: Advection, integrator: Integrator) -> None:
+        self.integrator = integrator
         self.advection = advection
         self.grid = advection.grid
         self.carried = Faces([])
@@ -135,9 +143,9 @@ class Bdf2Transport(Transport):
 
     names = ("velocity_before",)
 
-    def __init__(self, advection: Advection) -> None:
-        super().__init__(advection)
-        self.scheme = self.integrator = Bdf2()
+    def __init__(self, advection: Advection, integrator: Bdf2) -> None:
+        super().__init__(advection, integrator)
+        self.scheme = integrator
 
     def half_way(self, dt: float) -> Faces:
         """Return the velocity at t^n + dt/2."""
@@ -189,9 +197,9 @@ class MidpointTransport(Transport):
 
     names = ("velocity_middle", "velocity_kicked")
 
-    def __init__(self, advection: Advection) -> None:
-        super().__init__(advection)
-        self.scheme = self.integrator = Midpoint()
+    def __init__(self, advection: Advection, integrator: Midpoint) -> None:
+        super().__init__(advection, integrator)
+        self.scheme = integrator
         self._start = Faces([])
         self._read: Faces | None = None  # v'' as others read it
         self._last: tuple[Faces, Faces] | None = None
@@ -252,10 +260,11 @@ class MidpointTransport(Transport):
         return ahead
 
 
-#: The scene's ``time.integrator`` by name.
-TRANSPORTS: dict[str, type[Transport]] = {
-    "newmark": Transport,
-    "bdf2": Bdf2Transport,
-    "midpoint": MidpointTransport,
-    "symplectic-euler": Transport,
-}
+def transport(integrator: Integrator, advection: Advection) -> Transport:
+    """Return what carries a fluid for a scheme, or one made of it."""
+    if isinstance(integrator, Bdf2):
+        return Bdf2Transport(advection, integrator)
+    if isinstance(integrator, Midpoint):
+        return MidpointTransport(advection, integrator)
+    # a fluid is never explicit: its pressure holds at the step's end
+    return Transport(advection, Newmark() if integrator.explicit else integrator)

@@ -1,0 +1,1 @@
+"""Time integrators: a scheme is a file here and a line in ``registry.INTEGRATORS``."""
