@@ -216,6 +216,12 @@ class Simulation:
         for field in self.fields:
             field.forget()
 
+    def close(self) -> None:
+        """Free what PETSc holds of it: it can be asked nothing afterwards. Collective."""
+        self.solver.reset()
+        self.system.close()
+        petsc.collect_garbage()
+
     def prepare(self, resumes_at: float | None = None) -> list[str]:
         """Assemble and set the solver up once without moving, so that every mistake in the options shows now.
 

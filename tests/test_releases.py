@@ -75,3 +75,20 @@ def test_a_coupled_simulation_is_let_go_with_all_that_petsc_holds_of_it(newton):
         gc.collect()
         held.sweep(MPI.COMM_SELF)
     assert [thing() for thing in seen] == [None, None] and len(held._held) == before
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("scene", ["column", "neohookean"])
+def test_a_simulation_that_is_closed_leaves_petsc_nothing(scene):
+    held = releases.of(COMM)
+    gc.collect()
+    held.sweep(COMM)
+    before = len(held._held)
+    with only_options(["-options_file", "monolithic.opts"]):
+        sim = Simulation(COMM, job(COMM, scene, {"time.integrator": "newmark"}))
+        sim.prepare()
+        sim.advance()
+        block = sim.solid.block
+        assert block.handle and sim.system.operator.handle
+        sim.close()
+    assert not block.handle and not sim.system.operator.handle and len(held._held) == before

@@ -67,11 +67,12 @@ def _put(data: Any, key: str, value: Any) -> None:
 
 @contextmanager
 def simulation(comm: MPI.Comm, scene: Scene, options: str) -> Iterator[Simulation]:
-    """Have a simulation of a scene, solved as a shipped options file says. Collective."""
+    """Have a simulation of a scene, solved as a shipped options file says, and close it. Collective."""
     with only_options(["-options_file", options]):
         sim = Simulation(comm, scene)
         sim.prepare()
         yield sim
+        sim.close()
 
 
 def history(comm: MPI.Comm, scene: Scene, options: str, steps: int, column: str = "top.y") -> np.ndarray:

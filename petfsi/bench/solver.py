@@ -135,7 +135,7 @@ def solves(case: Case, contestants: list[tuple[Scene, str]], repeats: int) -> li
                 if options == MONOLITHIC:
                     row["factorisation"] = _factorisation(case, sim)
     for sim, _ in ready:
-        sim.solver.reset()
+        sim.close()
     del ready, sim
     petsc.collect_garbage()  # or the next case's matrices come on top
     return rows

@@ -74,6 +74,14 @@ class System:
         self._held = self._blocks()
         self._sizes: dict[str, tuple[int, float]] = {}
 
+    def close(self) -> None:
+        """Free the nest, its blocks and the vectors. Collective."""
+        things = [self.operator, self.solution, self.rhs, self.residual] if self.fields else []
+        things += [matrix for field in self.fields for matrix in field.matrices]
+        things += [block for coupling in self.couplings for block in coupling.blocks.values()]
+        for thing in things:
+            thing.destroy()
+
     @property
     def unknowns(self) -> dict[str, int]:
         """Unknowns of each field."""
