@@ -16,10 +16,15 @@ for name, value in {
 }.items():
     os.environ.setdefault(name, value)
 
+import hypothesis  # noqa: E402 - as below
 import pytest  # noqa: E402 - MPI and HDF5 read the environment when they are imported
 from mpi4py import MPI  # noqa: E402
 
 from petfsi.runs.stop import SIGNALS  # noqa: E402
+
+# how long examples take to make is a matter of what else the machine does
+hypothesis.settings.register_profile("busy", suppress_health_check=[hypothesis.HealthCheck.too_slow], deadline=None)
+hypothesis.settings.load_profile("busy")
 
 
 @pytest.hookimpl(tryfirst=True)

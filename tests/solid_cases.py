@@ -6,7 +6,7 @@ from petsc4py import PETSc
 
 from petfsi.fields.solid import SimplexSolid
 from petfsi.fields.solid.elements import Bodies, Elements, State
-from petfsi.fields.solid.materials import MATERIALS, lame_parameters
+from petfsi.fields.solid.materials import lame_parameters, named
 from petfsi.fields.solid.partition import distribute
 from petfsi.fields.solid.patches import grid_patches, grouped_mesh
 from petfsi.fields.solid.pattern import Pattern
@@ -132,7 +132,7 @@ def simplices(points, cells, order="linear", volumetric="full", patches=None):
 def elements_of(mesh, material="green", lame=LAME, mu=MU, lumped=False, volumetric="full"):
     one = np.ones(1)
     flag = one.astype(bool)
-    return Elements(mesh, Bodies(DENSITY * one, lame * one, mu * one, [MATERIALS[material]], flag & lumped,
+    return Elements(mesh, Bodies(DENSITY * one, lame * one, mu * one, [named(material)], flag & lumped,
                                  flag & (volumetric == "reduced"), 0 * one, 0 * one))  # fmt: skip
 
 

@@ -8,7 +8,8 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from petfsi.fields.solid.materials import MATERIALS, lame_parameters, project, projected
+from petfsi.fields.solid.materials import lame_parameters, named, project, projected
+from petfsi.registry import MATERIALS
 
 NONLINEAR = sorted(set(MATERIALS) - {"linear"})
 #: Materials that are finite and smooth for every F.
@@ -25,7 +26,7 @@ def respond(name, F, lame=LAME, mu=MU):
     F = np.asarray(F)
     n = F.shape[:-2]
     H = (F - np.eye(F.shape[-1])).reshape(-1, *F.shape[-2:])
-    answer = MATERIALS[name](H, np.full(len(H), lame), np.full(len(H), mu))
+    answer = named(name)(H, np.full(len(H), lame), np.full(len(H), mu))
     return tuple(a.reshape(n + a.shape[1:]) for a in answer)
 
 
@@ -104,7 +105,7 @@ def test_so_they_are_of_inverted_and_flat_elements(name, F):
 def test_without_a_tangent_energy_and_stress_are_the_same(name, dim):
     H = deformations(dim, 5) - np.eye(dim)
     lame, mu = np.full(5, LAME), np.full(5, MU)
-    with_tangent, without = MATERIALS[name](H, lame, mu), MATERIALS[name](H, lame, mu, tangent=False)
+    with_tangent, without = named(name)(H, lame, mu), named(name)(H, lame, mu, tangent=False)
     np.testing.assert_array_equal(without[0], with_tangent[0])
     np.testing.assert_array_equal(without[1], with_tangent[1])
     assert without[2].shape == (0, dim, dim, dim, dim)
@@ -153,7 +154,7 @@ def test_at_rest_every_material_is_hookes(name, dim):
 def test_tiny_strains_keep_their_digits(name, dim, size):
     """What is left of Hooke's energy and stress is the next order, whatever the strain: nothing drowns in F = I."""
     H = size * np.random.default_rng(4).standard_normal((20, dim, dim))
-    W, P, _ = MATERIALS[name](H, np.full(20, LAME), np.full(20, MU))
+    W, P, _ = named(name)(H, np.full(20, LAME), np.full(20, MU))
     stress = np.einsum("ijkl,nkl->nij", hooke(dim), H)
     np.testing.assert_allclose(W, np.einsum("nij,nij->n", stress, H) / 2, rtol=40 * size + 1e-14)
     np.testing.assert_allclose(P, stress, atol=np.abs(stress).max() * (40 * size + 1e-14))
@@ -248,13 +249,13 @@ def test_projection_leaves_what_is_no_number():
 def test_a_projected_material_differs_in_its_tangent_only():
     H = np.random.default_rng(9).uniform(-2, 2, (20, 2, 2))
     lame, mu = np.full(20, LAME), np.full(20, MU)
-    exact, clamped = MATERIALS["green"](H, lame, mu), projected(MATERIALS["green"])(H, lame, mu)
+    exact, clamped = named("green")(H, lame, mu), projected(named("green"))(H, lame, mu)
     np.testing.assert_array_equal(clamped[0], exact[0])
     np.testing.assert_array_equal(clamped[1], exact[1])
     project(exact[2], H)
     np.testing.assert_array_equal(clamped[2], exact[2])
-    assert projected(MATERIALS["green"])(H, lame, mu, tangent=False)[2].shape == (0, 2, 2, 2, 2)
-    assert projected(MATERIALS["linear"]) is MATERIALS["linear"]
+    assert projected(named("green"))(H, lame, mu, tangent=False)[2].shape == (0, 2, 2, 2, 2)
+    assert projected(named("linear")) is named("linear")
 
 
 def test_lame_parameters_invert_to_young_and_poisson():

@@ -37,7 +37,7 @@ from petfsi.bench import theory
 from petfsi.bench.case import MONOLITHIC, Case, history, job, simulation
 from petfsi.bench.report import Report, Row
 from petfsi.fields.solid import SimplexSolid
-from petfsi.fields.solid.materials import MATERIALS
+from petfsi.registry import MATERIALS
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 

@@ -13,7 +13,7 @@ from petfsi.fields.base import Slab
 from petfsi.fields.solid.elements import Bodies, Elements
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.loads import Body, Loads
-from petfsi.fields.solid.materials import MATERIALS, Material, lame_parameters, projected
+from petfsi.fields.solid.materials import Material, lame_parameters, named, projected
 from petfsi.fields.solid.partition import slab
 from petfsi.fields.solid.patches import grid_patches, grouped_mesh, grown_patches
 from petfsi.fields.solid.probes import Place, locate
@@ -298,7 +298,7 @@ def _bodies(solids: Mapping[str, Solid]) -> Bodies:
 
 
 def _material(solid: Solid) -> Material:
-    material = MATERIALS[solid.material]
+    material = named(solid.material)
     return projected(material) if solid.tangent == "projected" else material
 
 

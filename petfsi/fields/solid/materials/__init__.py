@@ -24,10 +24,13 @@ from petfsi import registry
 from petfsi.fields.solid.materials.kinematics import Material
 from petfsi.fields.solid.materials.projection import project, projected
 
-__all__ = ["MATERIALS", "Material", "lame_parameters", "project", "projected"]
+__all__ = ["Material", "lame_parameters", "named", "project", "projected"]
 
-#: The scene's ``solids.*.material`` by name.
-MATERIALS: dict[str, Material] = {name: registry.find(place) for name, place in registry.MATERIALS.items()}
+
+def named(name: str) -> Material:
+    """Return the material that a scene's ``solids.*.material`` names."""
+    material: Material = registry.find(registry.MATERIALS[name])
+    return material
 
 
 def lame_parameters(young: float, poisson: float) -> tuple[float, float]:
