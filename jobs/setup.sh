@@ -51,7 +51,7 @@ fi
 # Numba looks at a compiled function's own file alone: where a function that it calls has changed, it would go on with
 # the old one.
 kernels="$site/.petfsi-kernels"
-now=$(grep -rl --include='*.py' njit petfsi | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
+now=$(grep -rlE --include='*.py' 'njit|compiled_for' petfsi | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
 if [ "$(cat "$kernels" 2>/dev/null || true)" != "$now" ]; then
     find petfsi -name '*.nb[ci]' -delete
     echo "$now" > "$kernels"

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 from numba import njit
 
+from petfsi.compiled import compiled_for
+
 # Helpers get the constants of the closures below as arguments: a closure that held a compiled function could not be
 # cached on disk.
 
@@ -142,7 +144,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
         Whether ``basis`` holds the g_a themselves, one point an element, and ``table`` is not read.
     """
 
-    @njit(cache=True)
+    @compiled_for(dim, nodes, plain)
     def gradient(cells, basis, table, d, H):
         n_points = table.shape[0]
         g = np.empty((nodes, dim))
@@ -156,7 +158,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                             s += d[cells[e, a], i] * g[a, J]
                         H[e * n_points + q, i, J] = s
 
-    @njit(cache=True)
+    @compiled_for(dim, nodes, plain)
     def contract(C, S, T):
         for p in range(C.shape[0]):
             for i in range(dim):
@@ -167,7 +169,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                             s += C[p, i, J, k, L] * S[p, k, L]
                     T[p, i, J] += s
 
-    @njit(cache=True)
+    @compiled_for(dim, nodes, plain)
     def forces(cells, basis, table, w, T, volume, mass, V, b):
         n_points = table.shape[0]
         g, f, v = np.empty((nodes, dim)), np.empty((nodes, dim)), np.empty((nodes, dim))
@@ -195,7 +197,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                     for i in range(dim):
                         b[row, i] += f[a, i]
 
-    @njit(cache=True)
+    @compiled_for(dim, nodes, plain)
     def kinetic(cells, volume, mass, u, v):
         total = 0.0
         for e in range(cells.shape[0]):
@@ -207,7 +209,7 @@ def kernels(dim: int, nodes: int, plain: bool) -> SimpleNamespace:
                     total += volume[e] * mass[a, m] * s
         return total
 
-    @njit(cache=True)
+    @compiled_for(dim, nodes, plain)
     def tangent(cells, basis, table, w, C, volume, mass, A_M, A_K, node_ptr, slots, values):
         n_points = table.shape[0]
         rows = C.reshape((C.shape[0], dim, dim, dim * dim))

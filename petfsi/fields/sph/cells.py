@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from petfsi.compiled import compiled_for
+
 
 @dataclass(frozen=True)
 class CellGrid:
@@ -317,7 +319,7 @@ def _compile_fluid_pairs(dim):
     """Compile the half list for 2 or 3 dimensions."""
     runs, flat = 2 if dim == 2 else 5, dim == 2
 
-    @njit(cache=True)
+    @compiled_for(dim)
     def fluid(axes, owned, first, counts, reach2, lanes, other):
         start = np.zeros(owned.size + 1, dtype=np.int64)
         begin, end = np.empty(runs, dtype=np.int64), np.empty(runs, dtype=np.int64)
@@ -357,7 +359,7 @@ def _compile_wall_pairs(dim):
     """Compile the list of wall rows near fluid rows for 2 or 3 dimensions."""
     runs, flat = 3 if dim == 2 else 9, dim == 2
 
-    @njit(cache=True)
+    @compiled_for(dim)
     def wall(axes, owned, first, axes_wall, owned_wall, first_wall, counts, reach2, lanes, other):
         start = np.zeros(owned.size + 1, dtype=np.int64)
         begin, end = np.empty(runs, dtype=np.int64), np.empty(runs, dtype=np.int64)

@@ -19,6 +19,7 @@ import functools
 import numpy as np
 from numba import njit
 
+from petfsi.compiled import compiled_for
 from petfsi.fields.sph.kernels import shape
 
 X, V, VOLUME, RHO = 0, 3, 6, 7
@@ -44,7 +45,7 @@ def _blocks(start, n):
 def density_loop(dim: int, kernel: int, diffuses: bool):
     """Return the pass of fluid pairs that adds to the rates of density, with or without diffusion."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, diffuses, error_model="numpy")
     def density(start, other, rows, inv_s, f_scale, diffusion, g, lanes, total, diffusive):
         n = np.uint64(total.size)
         blocks = _blocks(start, n)
@@ -102,7 +103,7 @@ def _density_terms(blocks, n_blocks, lanes, kernel, inv_s, diffuses):
 def wall_density_loop(dim: int, kernel: int, sided: bool):
     """Return the pass of pairs with walls that adds to the rates of density; of ``sided`` walls, the part seen."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, sided, error_model="numpy")
     def wall_density(start, other, rows, x, v, volume, seen, inv_s, f_scale, total):
         for i in range(total.size):
             added = 0.0
@@ -126,7 +127,7 @@ def wall_density_loop(dim: int, kernel: int, sided: bool):
 def wall_pressure_loop(dim: int, kernel: int, sided: bool):
     """Return the pass that averages the fluid's pressure, continued to the wall rows."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, sided, error_model="numpy")
     def wall_pressure(start, other, x, rho, p, x_wall, a_wall, seen, g, inv_s, pressure, weight):
         for i in range(rho.size):
             for k in range(start[i], start[i + np.uint64(1)]):
@@ -151,7 +152,7 @@ def wall_pressure_loop(dim: int, kernel: int, sided: bool):
 def force_loop(dim: int, kernel: int, artificial: bool, laminar: bool):
     """Return the pass of fluid pairs that adds to forces, S and the power lost; with Pi, with c_ij or without."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, artificial, laminar, error_model="numpy")
     def force(start, other, rows, scaled, inv_s, f_scale, w_unit, alpha2, soft2, nu4, lanes, sums):
         n = np.uint64(scaled.size)
         blocks = _blocks(start, n)
@@ -276,7 +277,7 @@ def _scatter(sums, volume, other, i, begin, count, blocks, dim, artificial, lami
 def wall_force_loop(dim: int, kernel: int, sided: bool):
     """Return the pass of pairs with walls that adds to forces on both, S and the power lost."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, sided, error_model="numpy")
     def wall_force(
         start, other, rows, scaled, x, v, normal, depth, seen, no_slip, scaled_wall, rho_wall, volume, inv_s,
         f_scale, w_unit, nu4, near, stop, sums, f_wall,
@@ -327,7 +328,7 @@ def seen_loop(dim: int, n_bounds: int):
     it grows over a small part of a spacing, so that forces have no jumps there.
     """
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, n_bounds, error_model="numpy")
     def part_seen(start, other, x, x_wall, normal, depth, sided, outward, limit, inv_edge, seen):
         for i in range(x.shape[0]):
             for k in range(start[i], start[i + np.uint64(1)]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from petfsi.compiled import compiled_for
 from petfsi.geometry.predicates import _exact_height, _sign_of_sum, _two_product, above, side
 
 _HALF = np.uint64(32)
@@ -133,7 +134,7 @@ def _part(p, inverse, cell, only, begin, end):
 
 
 def _compile_blocked(dim):
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, error_model="numpy")
     def blocked(p0, p1, p2, q0, q1, q2, cells, corners):
         """Return a facet that crosses the segment from p to q, of those in the cells that it goes through, else -1."""
         low, inverse, counts, start, item = cells
@@ -174,7 +175,7 @@ blocked_2d, blocked_3d = _compile_blocked(2), _compile_blocked(3)
 
 
 def _compile_words(dim):
-    @njit(cache=True)
+    @compiled_for(dim)
     def words(x, cells, clusters, reach, same):
         """Return the bits of where points may be: above (the lower half of a word) and below clusters."""
         low, inverse, counts, start, item = cells
@@ -213,7 +214,7 @@ WORDS = {dim: _compile_words(dim) for dim in (2, 3)}
 def _compile_strike(dim):
     z, most = dim - 1, HIDING[dim]
 
-    @njit(cache=True)
+    @compiled_for(dim)
     def strike(start, other, x, word, cells, corners):
         """Strike pairs of particles; return how many are left."""
         kept, begin = start[0], start[0]

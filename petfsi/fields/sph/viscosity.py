@@ -24,6 +24,7 @@ import numpy as np
 from mpi4py import MPI
 from numba import njit
 
+from petfsi.compiled import compiled_for
 from petfsi.fields.sph.cells import Pairs
 from petfsi.fields.sph.kernels import shape
 from petfsi.fields.sph.law import Law
@@ -188,7 +189,7 @@ class ImplicitViscosity:
 def _drag_loop(dim: int, kernel: int):
     """Return the pass that fills c (n_pairs,); ``scale`` is -4 nu times the factor of the kernel's f."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, error_model="numpy")
     def drag(start, other, x, rho, m, inv_s, scale, c):
         for i in range(rho.size):
             for k in range(start[i], start[i + 1]):
@@ -205,7 +206,7 @@ def _drag_loop(dim: int, kernel: int):
 def _wall_drag_loop(dim: int, kernel: int, sided: bool):
     """Return the pass that fills c' (n_pairs,) of a set of walls, as ``loops.wall_force_loop`` has it."""
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, kernel, sided, error_model="numpy")
     def wall_drag(
         start, other, x, rho, m, x_wall, normal, depth, seen, no_slip, volume, rho_wall, inv_s, scale, c
     ):  # fmt: skip

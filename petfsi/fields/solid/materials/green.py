@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from petfsi.compiled import compiled_for
 from petfsi.fields.solid.materials.kinematics import twice_green_strain
 
 
@@ -30,7 +30,7 @@ def green(
 def _compile(dim):
     # dim as a constant of the closure lets the compiler unroll the loops over axes
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, error_model="numpy")
     def kernel(H, lame, mu, tangent):
         n = H.shape[0]
         W = np.empty(n)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from petfsi.compiled import compiled_for
 
 
 def linear(
@@ -26,7 +27,7 @@ def linear(
 def _compile(dim):
     # dim as a constant of the closure lets the compiler unroll the loops over axes
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, error_model="numpy")
     def kernel(H, lame, mu, tangent):
         n = H.shape[0]
         W = np.empty(n)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import log, log1p
 
 import numpy as np
-from numba import njit
 
+from petfsi.compiled import compiled_for
 from petfsi.fields.solid.materials.kinematics import cofactor, higher_invariants, log_excess, twice_green_strain
 
 
@@ -37,7 +37,7 @@ def neohookean(
 def _compile(dim):
     # dim as a constant of the closure lets the compiler unroll the loops over axes
 
-    @njit(cache=True, error_model="numpy")
+    @compiled_for(dim, error_model="numpy")
     def kernel(H, lame, mu, tangent):
         n = H.shape[0]
         W = np.empty(n)
