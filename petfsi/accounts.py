@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petfsi.couplings.base import Coupling
 from petfsi.fields.base import Field, Reader, Slab, SolidField, Work, scalar_slab
 from petfsi.force_work import ForceWork
-from petfsi.integrators import INTEGRATORS
+from petfsi.integrators import named
 from petfsi.scene.schema import Scene
 from petfsi.solving.regions import ClosedRegions
 
@@ -90,7 +90,7 @@ class Accounts:
         self._loaded = any(solid.loads or solid.body_force for solid in scene.solids.values())
         self._initial, self.exchanged = 0.0, 0.0
         self._sums = np.zeros(4)
-        integrator = INTEGRATORS[scene.time.integrator]()
+        integrator = named(scene.time.integrator)
         self._solid = ForceWork(next((f for f in fields if isinstance(f, SolidField)), None), couplings, integrator)
         self._centred = 0.0 < integrator.moment(1.0) < 1.0
         self._power: np.ndarray | None = None  # of the step before

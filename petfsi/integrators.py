@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
+
+from petfsi.registry import INTEGRATORS, find
 
 
 @dataclass(frozen=True)
@@ -481,11 +482,7 @@ def moved(stage: Stage, by: np.ndarray) -> Stage:
     return replace(stage, tangent_at=stage.tangent_at + way, shift=stage.shift - way)
 
 
-#: The scene's ``time.integrator`` by name.
-INTEGRATORS: dict[str, Callable[[], Integrator]] = {
-    "newmark": Newmark,
-    "bdf2": Bdf2,
-    "midpoint": Midpoint,
-    "symplectic-euler": SymplecticEuler,
-    "static": Static,
-}
+def named(name: str) -> Integrator:
+    """Return the scheme that the scene's ``time.integrator`` names."""
+    scheme: Integrator = find(INTEGRATORS[name])()
+    return scheme

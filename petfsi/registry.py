@@ -1,4 +1,4 @@
-"""What scenes may name, and where it lives: a new fluid, coupling or material is its file and a line here."""
+"""What scenes may name, and where it lives: a new fluid, coupling, material or integrator is a line here."""
 
 from __future__ import annotations
 
@@ -14,6 +14,13 @@ COUPLINGS = {
     "ray": "petfsi.couplings.ray:RayCoupling",
     "pressure": "petfsi.couplings.particles:PressureTransfer",
     "repulsion": "petfsi.couplings.repulsion:RepulsionTransfer",
+}
+INTEGRATORS = {
+    "newmark": "petfsi.integrators:Newmark",
+    "bdf2": "petfsi.integrators:Bdf2",
+    "midpoint": "petfsi.integrators:Midpoint",
+    "symplectic-euler": "petfsi.integrators:SymplecticEuler",
+    "static": "petfsi.integrators:Static",
 }
 MATERIALS = {
     "green": "petfsi.fields.solid.materials.green:green",

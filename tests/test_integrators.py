@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from petfsi.integrators import INTEGRATORS, Motion
+from petfsi.integrators import Motion, named
+from petfsi.registry import INTEGRATORS
 
 DYNAMIC = [name for name in INTEGRATORS if name != "static"]
 K = np.array([[3.0, -1.0], [-1.0, 2.0]])
@@ -25,7 +26,7 @@ def start(d, u):
 
 @pytest.mark.parametrize("name", DYNAMIC)
 def test_the_factor_is_that_of_the_stage(name):
-    scheme = INTEGRATORS[name]()
+    scheme = named(name)
     motion = start([1.0, 0.0], [0.0, 1.0])
     for h in (0.1, 0.15, 0.07):
         assert scheme.factor(h, motion.past_dt) == pytest.approx(1 / scheme.stage(motion, h).a, rel=1e-15)
@@ -36,7 +37,7 @@ def test_the_factor_is_that_of_the_stage(name):
 @pytest.mark.parametrize("name", ["bdf2", "midpoint"])
 def test_steps_of_any_length_solve_a_parabola_exactly(name):
     """d = t^2 / 2 under a constant force, from two exact levels on."""
-    scheme = INTEGRATORS[name]()
+    scheme = named(name)
     one = np.ones((1, 1))
 
     def exact(t):
@@ -51,7 +52,7 @@ def test_steps_of_any_length_solve_a_parabola_exactly(name):
 
 
 def test_midpoint_keeps_the_energy_of_a_swing():
-    scheme, motion = INTEGRATORS["midpoint"](), start([1.0, -0.3], [0.2, 2.0])
+    scheme, motion = named("midpoint"), start([1.0, -0.3], [0.2, 2.0])
 
     def energy():
         d, u = motion.displacement[:, 0], motion.velocity[:, 0]
@@ -68,7 +69,7 @@ def test_bdf2_damps_what_is_too_fast_and_midpoint_does_not():
     for name in ("bdf2", "midpoint"):
         motion = start([1.0], [0.0])
         for _ in range(6):
-            motion = advance(INTEGRATORS[name](), motion, 1.0, M=np.eye(1), K=1e8 * np.eye(1))
+            motion = advance(named(name), motion, 1.0, M=np.eye(1), K=1e8 * np.eye(1))
         left[name] = abs(motion.displacement[0, 0])
     assert left["bdf2"] < 1e-6
     assert left["midpoint"] == pytest.approx(1.0, abs=1e-5)
@@ -76,7 +77,7 @@ def test_bdf2_damps_what_is_too_fast_and_midpoint_does_not():
 
 def test_where_midpoint_linearises_does_not_swing_with_a_stiff_mode():
     """u^n alternates between two large values; d~ must stay as small as d."""
-    scheme, motion = INTEGRATORS["midpoint"](), start([0.0], [1.0])
+    scheme, motion = named("midpoint"), start([0.0], [1.0])
     for n in range(20):
         motion = advance(scheme, motion, 1.0, M=np.eye(1), K=1e8 * np.eye(1))
         assert abs(motion.velocity[0, 0]) > 0.9

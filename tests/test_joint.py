@@ -9,7 +9,7 @@ from test_cutcell import unscaled
 from test_run import last_output, petfsi
 
 from petfsi.errors import InputError
-from petfsi.integrators import INTEGRATORS
+from petfsi.registry import INTEGRATORS
 from petfsi.scene.load import dump_scene, scene_from_dict
 from petfsi.simulation import Simulation
 

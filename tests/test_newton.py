@@ -13,7 +13,7 @@ from processes import environment
 from step_cases import SWING, block, loaded, motion, prepared, stepped
 
 from petfsi.errors import InputError, SolveError
-from petfsi.integrators import INTEGRATORS
+from petfsi.integrators import named
 from petfsi.output.history import read_history
 
 SCENES = Path(__file__).parent / "scenes"
@@ -41,7 +41,7 @@ def exact():
 def test_every_integrator_keeps_its_order_on_a_nonlinear_swing(integrator, n, options, exact):
     errors = [np.linalg.norm(swing(integrator, m, *options) - exact) for m in (n, 2 * n)]
     assert np.linalg.norm(exact) > 3 * errors[0] > 0.01
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(INTEGRATORS[integrator]().order, abs=0.1), errors
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(named(integrator).order, abs=0.1), errors
 
 
 def energies(material, dt, n, *options):

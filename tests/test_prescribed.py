@@ -7,7 +7,7 @@ from mac_cases import reader
 from mpi4py import MPI
 from solid_cases import body, field, gathered, step
 
-from petfsi.integrators import INTEGRATORS
+from petfsi.registry import INTEGRATORS
 
 WAY = {"x": "0.05*sin(4*t + y)", "y": "0.02*t*x"}
 

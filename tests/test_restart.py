@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from step_cases import SWING, block, loaded, prepared, stored
 
-from petfsi.integrators import INTEGRATORS
+from petfsi.registry import INTEGRATORS
 from petfsi.scene.load import scene_from_dict
 from petfsi.scene.schema import Scene
 

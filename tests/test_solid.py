@@ -28,7 +28,8 @@ from petfsi.errors import InputError
 from petfsi.fields.solid.elements import CHUNK
 from petfsi.fields.solid.materials import lame_parameters
 from petfsi.geometry.meshes import box_mesh
-from petfsi.integrators import INTEGRATORS
+from petfsi.integrators import named
+from petfsi.registry import INTEGRATORS
 from petfsi.scene.tables import Box
 
 
@@ -223,7 +224,7 @@ def swing_error(integrator, n, exact, uneven=False):
 def test_an_integrator_keeps_its_order_on_a_nonlinear_oscillation(integrator, counts, uneven, swing):
     errors = np.array([swing_error(integrator, n, swing, uneven) for n in counts])
     seen = np.log2(errors[:-1] / errors[1:])[-1]
-    assert seen == pytest.approx(INTEGRATORS[integrator].order, abs=0.1), errors
+    assert seen == pytest.approx(named(integrator).order, abs=0.1), errors
 
 
 def test_midpoint_keeps_the_energy_of_small_swings():

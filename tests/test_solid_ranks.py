@@ -10,8 +10,8 @@ from solid_cases import YOUNG, body, field, gathered, step, wave
 from petfsi.errors import InputError
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.partition import Fetch, bisect
-from petfsi.integrators import INTEGRATORS
 from petfsi.petsc import Layout
+from petfsi.registry import INTEGRATORS
 
 #: Those in which a body may be free.
 DYNAMIC = [name for name in INTEGRATORS if name != "static"]

@@ -10,7 +10,7 @@ from test_restart import STEPS, goes_on
 
 from petfsi.errors import SolveError
 from petfsi.fields.solid.elements import State
-from petfsi.integrators import INTEGRATORS
+from petfsi.registry import INTEGRATORS
 from petfsi.scene.load import scene_from_dict
 
 OMEGA, WAY, PULL = 12.0, np.array([1e-3, -4e-4]), 5.0

@@ -13,13 +13,14 @@ from mpi4py import MPI
 
 from petfsi.errors import InputError
 from petfsi.fields.base import Reader
-from petfsi.integrators import INTEGRATORS
+from petfsi.integrators import named
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output import files
 from petfsi.output.manifest import OriginMark
 from petfsi.output.mesh_files import mesh_files
 from petfsi.output.rundir import MOST_TEXT, RunDirectory
 from petfsi.ranks import on_root
+from petfsi.registry import INTEGRATORS
 from petfsi.scene.dump import as_toml, drop_idle
 from petfsi.scene.load import load_scene
 from petfsi.scene.schema import Scene
@@ -32,7 +33,7 @@ _SHOWN = 160
 #: What a checkpoint keeps besides fields, and a new run begins for itself.
 _OWN = ("clock", "accounts", "guard", "stable")
 #: What schemes remember of earlier steps of a solid, and where its stable step was found.
-_PAST = (*{name for scheme in INTEGRATORS.values() for name in scheme().past}, "displacement_measured")
+_PAST = (*{name for scheme in INTEGRATORS for name in named(scheme).past}, "displacement_measured")
 #: What the state of a fluid does not hang on: numbers of its sides, and what it begins with or is advanced with.
 _FREE_OF_SIDES = ("speed", "along", "smoke", "ramp", "pressure", "hydrostatic", "entering", "velocity")
 _FREE = {

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, PrivateAttr, Tag, field_validator
 from pydantic_core import PydanticCustomError
 
-from petfsi.integrators import INTEGRATORS
-from petfsi.registry import COUPLINGS, MATERIALS
+from petfsi.registry import COUPLINGS, INTEGRATORS, MATERIALS
 from petfsi.scene.fluids import Fluid
 from petfsi.scene.tables import Flag, Number, Real, Shape, Table, Vector, Whole, one_of
 

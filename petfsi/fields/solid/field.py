@@ -28,7 +28,7 @@ from petfsi.fields.solid.turning import Turning, bodies_of
 from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles
-from petfsi.integrators import INTEGRATORS, Integrator, Motion, Stage, moved, relinearised, stable_step
+from petfsi.integrators import Integrator, Motion, Stage, moved, named, relinearised, stable_step
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression, ExpressionError
@@ -85,7 +85,7 @@ class NodalSolid(SolidField):
         self.width = len(components)
         self.names = list(solids)
         self.extent = float(np.ptp(mesh.points, axis=0).max())
-        self._integrator: Integrator = INTEGRATORS[scene.time.integrator]()
+        self._integrator: Integrator = named(scene.time.integrator)
         self.explicit = self.diagonal = self._integrator.explicit
         self._has_inertia = bool(np.isfinite(self._integrator.factor(1.0, 0.0)))
         if self.explicit:
