@@ -288,6 +288,28 @@ def info(ctx: click.Context) -> NoReturn:
     ctx.exit(_alone(work))
 
 
+@cli.command("help")
+@click.argument("key", required=False)
+@click.pass_context
+def help_(ctx: click.Context, key: str | None) -> NoReturn:
+    """Say what KEY of a scene means: its unit, default and choices, or those of all.
+
+    KEY is a key or a table such as fluid.sides or solids.layer.young, or the last word of one: young.
+    """
+
+    def work() -> int:
+        command = cli.get_command(ctx, key or "")
+        if command is not None:
+            _say(command.get_help(click.Context(command, info_name=key, parent=ctx.parent)))
+            return 0
+        from petfsi.scene.reference import explain, reference
+
+        _say(reference() if key is None else explain(key))
+        return 0
+
+    ctx.exit(_alone(work))
+
+
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:
     """Start PETSc with the options that count at its start, of a run or of none; nothing else reaches it from outside.
 

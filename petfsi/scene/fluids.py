@@ -48,9 +48,11 @@ class FluidTable(Table):
     origin: Annotated[
         Vector,
         Field(description="m"),
-        Doc("The corner with the smallest coordinates of the grid, or of the box that holds the particles."),
+        Doc("The corner with the smallest coordinates: of the grid, or of the particles' box."),
     ]
-    size: Annotated[Vector, Field(description="m"), Doc("The lengths of the grid, or of the box, each greater than 0.")]
+    size: Annotated[
+        Vector, Field(description="m"), Doc("The lengths of the grid, or of the particles' box, each greater than 0.")
+    ]
     initial: Annotated[FluidInitial, Doc("The fluid at time zero.")] = FluidInitial()
 
 
@@ -67,7 +69,7 @@ class MacFluid(FluidTable):
     sides: Annotated[Sides, Doc("What the grid is bounded by.")] = Sides()
     advection: Annotated[
         Literal["cubic", "linear"],
-        Doc("How values between grid points are interpolated, where velocity and smoke are carried."),
+        Doc("How velocity and smoke are interpolated between points, as they are carried."),
     ] = "cubic"
     smoke: Annotated[
         Smoke | None, Doc("A scalar that is carried along; the table may be empty. Left out, none is.")
@@ -109,14 +111,14 @@ class SphFluid(FluidTable):
         Real | None,
         Field(gt=0, le=1e6, description="m/s"),
         Doc(
-            "The speed of sound c: the larger, the stiffer the fluid and the shorter the steps. Left out, it is 10 "
-            "sqrt(2 g H) of the fill, or ten times its largest speed, that of jets and sides included."
+            "The speed of sound c: the larger, the stiffer the fluid, and the shorter steps. Left out, it is 10 sqrt(2 "
+            "g H) of the fill, or ten times its largest speed, that of jets and sides included."
         ),
     ] = None
     viscosity: Annotated[
         Real,
         Field(ge=0, description="Pa s"),
-        Doc("The viscosity. Where there is any, no-slip sides and obstacles hold the fluid."),
+        Doc("How viscous the fluid is. Where it is, no-slip sides and obstacles hold it."),
     ] = 0.0
     viscosity_solve: Annotated[
         Literal["auto", "explicit", "implicit"],
@@ -131,7 +133,7 @@ class SphFluid(FluidTable):
     density_diffusion: Annotated[
         Real,
         Field(ge=0, le=1, description="delta of delta-SPH; 0 is none"),
-        Doc("How strongly densities are smoothed, less what the hydrostatic pressure would diffuse."),
+        Doc("How strongly densities are smoothed, but for the hydrostatic pressure's part."),
     ] = 0.1
     shifting: Annotated[
         Flag, Doc("Whether particles go a little to where they are fewer; not near a free surface.")
@@ -147,7 +149,7 @@ class SphFluid(FluidTable):
     fill: Annotated[
         list[Shape],
         Field(min_length=1, description="where liquid is at the start"),
-        Doc("Where liquid is at the start: shapes and mesh files; solids and obstacles are left out."),
+        Doc("Where liquid is at the start: shapes and mesh files. What solids and obstacles fill holds none."),
     ]
     pressure: Annotated[
         Literal["hydrostatic", "none"],

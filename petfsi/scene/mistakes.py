@@ -19,6 +19,14 @@ from petfsi.scene.schema import Scene
 ABSENT = object()
 #: Characters of a key that are shown.
 LONGEST = 100
+#: What numbers must be, by pydantic's names of bounds.
+BOUNDS = {
+    "gt": "greater than {:g}",
+    "ge": "{:g} or more",
+    "lt": "less than {:g}",
+    "le": "{:g} or less",
+    "multiple_of": "a multiple of {:g}",
+}
 #: How much alike names of different tables must be, from 0 to 1, for one to be taken for the other.
 ALIKE = 0.75
 
@@ -81,6 +89,9 @@ def describe(entry: Mapping[str, Any]) -> Problem:
 
 def _allowed(entry: Mapping[str, Any]) -> str:
     context = entry.get("ctx", {})
+    for bound, words in BOUNDS.items():
+        if bound in context:
+            return f"must be {words.format(context[bound])}"
     match entry["type"]:
         case "missing":
             return "is missing"
@@ -100,16 +111,6 @@ def _allowed(entry: Mapping[str, Any]) -> str:
             return "must be a table"
         case "literal_error":
             return f"must be {context['expected']}"
-        case "greater_than":
-            return f"must be greater than {context['gt']:g}"
-        case "greater_than_equal":
-            return f"must be {context['ge']:g} or more"
-        case "less_than":
-            return f"must be less than {context['lt']:g}"
-        case "less_than_equal":
-            return f"must be {context['le']:g} or less"
-        case "multiple_of":
-            return f"must be a multiple of {context['multiple_of']:g}"
         case "too_short" | "string_too_short":
             return "must not be empty"
     return entry["msg"]

@@ -49,12 +49,12 @@ class Time(Table):
     above_limit: Annotated[
         Literal["refuse", "subcycle"],
         Field(description="what becomes of steps above an explicit scheme's stable one"),
-        Doc("Whether steps longer than the stable one of what is explicit are refused or divided."),
+        Doc("Whether steps above the stable one of what is explicit are refused or divided."),
     ] = "refuse"
     retries: Annotated[
         Whole,
         Field(ge=0, le=20, description="how often a step that fails is halved"),
-        Doc("How often a step whose solve fails is taken again in two halves, these in halves, and so on."),
+        Doc("How often a step that fails is halved. It is taken again in halves, these in halves, and so on."),
     ] = 3
     energy_limit: Annotated[
         Real,
@@ -94,8 +94,8 @@ class Coupling(Table):
         str | None,
         BeforeValidator(OneOf(COUPLINGS, optional=True)),
         Doc(
-            "What joins them: of a grid cutcell or ray (as published), of particles pressure or repulsion. Left out, "
-            "it is cutcell or pressure, as suits the kind of fluid."
+            "How they act on each other. A grid has cutcell or ray (as published), particles have pressure or "
+            "repulsion. Left out, it is cutcell or pressure, as suits the kind of fluid."
         ),
     ] = None
     quadrature: Annotated[
@@ -109,12 +109,12 @@ class Probe(Table):
     of: Annotated[
         str,
         Field(description="a solid's name, fluid, or what a force is on"),
-        Doc('What is asked: a solid by its name, "fluid", or for a force a side or an obstacle.'),
+        Doc('What is asked: a solid by its name, "fluid", or what feels a force. That is a side or an obstacle.'),
     ]
     at: Annotated[
         Vector | None,
         Field(description="m; in a solid, where the point is at rest"),
-        Doc("The point. Left out of front and force."),
+        Doc("Where it is asked. Left out of front and force."),
     ] = None
     quantity: Annotated[
         Literal["displacement", "velocity", "angle", "pressure", "smoke", "front", "level", "force"],
@@ -143,7 +143,7 @@ class Checkpoint(Table):
     every: Annotated[
         Annotated[Real, Field(gt=0)] | None,
         Field(description="s of scene time"),
-        Doc("The time from one checkpoint to the next. Left out, there is only the one that every end writes."),
+        Doc("The time from one checkpoint to the next. Left out, one is written at the end alone."),
     ] = None
     keep: Annotated[Whole, Field(ge=1), Doc("How many of the newest checkpoints stay.")] = 3
 

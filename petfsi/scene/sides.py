@@ -92,7 +92,7 @@ Rest = Annotated[
         custom_error_message="must be 'slip', 'open' or 'hydrostatic', or a table of pressure or hydrostatic",
     ),
     Field(description="what the remainder of the side is"),
-    Doc("What the side is beside the jet's region: as sides of a grid are, but not periodic."),
+    Doc("What the side is beside the jet's region: as any side, but not periodic."),
 ]
 
 

@@ -29,7 +29,7 @@ class Tagged(Table):
     tag: Annotated[
         str,
         Field(min_length=1, description="the name of a group of facets or nodes in the mesh file"),
-        Doc("The name, or number, of the group: of facets, else of nodes, else of cells, whose corners it means."),
+        Doc("The name, or number, of the group. Of facets, else of nodes, else of cells, whose corners it means."),
     ]
 
 
@@ -55,8 +55,8 @@ class Support(Table):
         Where,
         Field(description=_WHERE),
         Doc(
-            "Which nodes are held: a side of the body at rest, all, a beam's start or end, a shape or a tag. Sides are "
-            "those of the box around the body."
+            "Which nodes are held. A side is that of the box around the body at rest, start and end are those of a "
+            "beam; or a table: a shape, or a mesh file's tag."
         ),
     ]
     fix: Annotated[
@@ -72,7 +72,7 @@ class Support(Table):
     displacement: Annotated[
         dict[Component, Number],
         Field(description="m of fixed axes, rad; may depend on x, y, z, t"),
-        Doc("How far they are moved along fixed axes, by name, from rest; an axis has this or a velocity."),
+        Doc("How far they are moved along fixed axes, by name, from rest. An axis has this or a velocity."),
     ] = {}
 
 
@@ -82,7 +82,7 @@ class Load(Table):
     where: Annotated[
         Where | None,
         Field(description=_WHERE),
-        Doc("Which boundary facets, of a beam which elements, are loaded: as of supports. Left out of a force."),
+        Doc("Which facets of the surface, or elements of a beam, are loaded. As of supports; left out of a force."),
     ] = None
     traction: Annotated[
         list[Number] | None,
@@ -119,7 +119,7 @@ class Load(Table):
     moment: Annotated[
         Number | None,
         Field(description="N m, on a beam; may depend on x, y, t"),
-        Doc("A moment at a point of a beam, with a force or alone; positive ones turn from x to y. Left out, none is."),
+        Doc("A moment at a point of a beam, with a force or alone. Positive ones turn x to y. Left out, none is."),
     ] = None
 
     @property
@@ -181,7 +181,7 @@ class Solid(Table):
     elements: Annotated[
         Literal["linear", "quadratic"],
         Field(description="order of the shape functions"),
-        Doc("The order of the elements; quadratic ones have straight sides, and nodes in their middles."),
+        Doc("The order of the elements. Quadratic ones have straight sides, with nodes in the middles."),
     ] = "linear"
     volumetric: Annotated[
         Literal["full", "reduced"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,9 +23,9 @@ def _number_or_text(value: Any) -> Any:
     return value
 
 
-def either(names: Collection[str]) -> str:
-    """Return names as a message lists what may be said: ``'a', 'b' or 'c'``."""
-    quoted = [f"'{name}'" for name in names]
+def either(names: Iterable[object]) -> str:
+    """Return names, or numbers, as messages list what may be said: ``'a', 'b' or 'c'``."""
+    quoted = [repr(name) for name in names]
     return " or ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
 
 
@@ -125,9 +125,9 @@ class Beam(Table):
     theory: Annotated[
         Literal["timoshenko", "euler-bernoulli"],
         Doc(
-            "How the beam deforms. timoshenko: geometrically exact, with shear GA = 5/6 E h/(2 + 2 nu); euler- "
-            "bernoulli: moderate rotations, without shear. Both bend with EI of the young that is given, not E/(1 - "
-            "nu^2)."
+            "How the beam deforms. timoshenko: geometrically exact, with shear GA = 5/6 E h/(2 + 2 nu); "
+            "euler-bernoulli: moderate rotations, without shear. Both bend with EI of the young that is given, not "
+            "E/(1 - nu^2)."
         ),
     ] = "timoshenko"
 
