@@ -310,6 +310,32 @@ def help_(ctx: click.Context, key: str | None) -> NoReturn:
     ctx.exit(_alone(work))
 
 
+@cli.command()
+@click.argument("path", type=click.Path(path_type=Path), default="scene.toml")
+@click.option(
+    "--kind",
+    type=click.Choice(["grid", "particles", "solid"]),
+    default="grid",
+    help="What is in it: a fluid on a grid with an elastic flap (the default), particles with a beam, a solid alone.",
+)
+@click.pass_context
+def new(ctx: click.Context, path: Path, kind: str) -> NoReturn:
+    """Write a scene to begin with to PATH, scene.toml by default: it runs as it is, in seconds.
+
+    What stands at PATH already stays.
+    """
+
+    def work() -> int:
+        if _launched_rank() > 0:
+            return 0  # one file
+        from petfsi.scene.starters import write_starter
+
+        _say(write_starter(path, kind))
+        return 0
+
+    ctx.exit(_alone(work))
+
+
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:
     """Start PETSc with the options that count at its start, of a run or of none; nothing else reaches it from outside.
 
