@@ -293,6 +293,54 @@ def info(ctx: click.Context) -> NoReturn:
     ctx.exit(_alone(work))
 
 
+@cli.command("help")
+@click.argument("key", required=False)
+@click.pass_context
+def help_(ctx: click.Context, key: str | None) -> NoReturn:
+    """Say what KEY of a scene means: its unit, default and choices, or those of all.
+
+    KEY is a key or a table such as fluid.sides or solids.layer.young, or the last word of one: young.
+    """
+
+    def work() -> int:
+        command = cli.get_command(ctx, key or "")
+        if command is not None:
+            _say(command.get_help(click.Context(command, info_name=key, parent=ctx.parent)))
+            return 0
+        from petfsi.scene.reference import explain, reference
+
+        _say(reference() if key is None else explain(key))
+        return 0
+
+    ctx.exit(_alone(work))
+
+
+@cli.command()
+@click.argument("path", type=click.Path(path_type=Path), default="scene.toml")
+@click.option(
+    "--kind",
+    type=click.Choice(["grid", "particles", "solid"]),
+    default="grid",
+    help="What is in it: a fluid on a grid with an elastic flap (the default), particles with a beam, a solid alone.",
+)
+@click.pass_context
+def new(ctx: click.Context, path: Path, kind: str) -> NoReturn:
+    """Write a scene to begin with to PATH, scene.toml by default: it runs as it is, in seconds.
+
+    What stands at PATH already stays.
+    """
+
+    def work() -> int:
+        if _launched_rank() > 0:
+            return 0  # one file
+        from petfsi.scene.starters import write_starter
+
+        _say(write_starter(path, kind))
+        return 0
+
+    ctx.exit(_alone(work))
+
+
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:
     """Start PETSc with the options that count at its start, of a run or of none; nothing else reaches it from outside.
 

@@ -14,7 +14,7 @@ from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.meshes import _check, build_mesh
 from petfsi.geometry.surfaces import boundary_facets, shells, signed_volumes
 from petfsi.scene.load import scene_from_dict
-from petfsi.scene.schema import Solid
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Ball
 
 VOLUME = {2: math.pi, 3: 4 * math.pi / 3}

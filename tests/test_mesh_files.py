@@ -12,7 +12,7 @@ from petfsi.geometry.places import located, located_facets, read_tags, with_midd
 from petfsi.geometry.quadratic import with_middles as quadratic
 from petfsi.geometry.surfaces import boundary_facets, signed_volumes
 from petfsi.output.history import read_history
-from petfsi.scene.schema import Solid, Tagged
+from petfsi.scene.solids import Solid, Tagged
 from petfsi.scene.tables import Shape
 
 #: Two unit squares side by side, two triangles each: the right one is the solid; the left edge of that is between them.

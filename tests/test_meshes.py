@@ -8,7 +8,7 @@ from petfsi.errors import InputError
 from petfsi.geometry.meshes import SimplexMesh, box_mesh, build_mesh, read_surface
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, shells, signed_volumes
-from petfsi.scene.schema import Solid
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Box, Shape
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

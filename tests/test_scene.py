@@ -225,7 +225,7 @@ BROKEN = [
     (["solids.layer.shape.box.cell=[1]"], "solids.layer.shape.box.cell", "did you mean 'cells'?"),
     (["fluid.gravity=[0.0]"], "fluid.gravity", "it stands at the top of the scene"),
     (["fluid.dt=0.1"], "fluid.dt = 0.1", "did you mean 'time.dt'?"),
-    (["fluid.sides.right.inflow.poisson=0.3"], "poisson = 0.3", "did you mean 'solids.<name>.poisson'?"),
+    (["fluid.sides.right.inflow.poisson=0.3"], "poisson = 0.3", "did you mean 'solids.NAME.poisson'?"),
     (["output.qqq=1"], "output.qqq = 1", "known here are every"),
     # lengths and sizes
     (["gravity=[0.0]"], "gravity = [0.0]", "must have 2 items, as dim = 2"),

@@ -14,8 +14,8 @@ from petfsi.fields.sph.kernels import Kernel
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.solids import build_solids, nearest, pseudonormals
 from petfsi.geometry.obstacles import obstacle_surface
-from petfsi.scene.fluids import InflowSide
 from petfsi.scene.schema import Obstacle
+from petfsi.scene.sides import InflowSide
 from petfsi.scene.tables import Shape
 
 DX = 0.1

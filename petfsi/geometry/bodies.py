@@ -14,8 +14,9 @@ from petfsi.geometry.places import Tags, located, located_facets, read_tags
 from petfsi.geometry.shapes import bounds, inside
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.scene.checks import check_inside_grid
-from petfsi.scene.schema import Obstacle, Scene, Solid
+from petfsi.scene.schema import Obstacle, Scene
 from petfsi.scene.shape_checks import images, may_meet, periods
+from petfsi.scene.solids import Solid
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

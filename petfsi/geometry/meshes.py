@@ -24,7 +24,7 @@ from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, Kind, simplices
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.messages import shown
-from petfsi.scene.schema import Solid
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Box, Shape
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from petfsi.geometry.balls import unit_ball
 from petfsi.geometry.meshes import read_surface
 from petfsi.geometry.seams import MEET, Seams, find_seams
 from petfsi.geometry.surfaces import boundary_facets
-from petfsi.scene.fluids import InflowSide, MovingSide
 from petfsi.scene.schema import Obstacle, Scene
 from petfsi.scene.shape_checks import OPPOSITE
+from petfsi.scene.sides import InflowSide, MovingSide
 from petfsi.scene.tables import Ball, Box, Cylinder, Halfspace
 
 #: The most facets that one round obstacle is made of.

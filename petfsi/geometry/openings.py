@@ -15,8 +15,9 @@ from numba import njit
 
 from petfsi.errors import InputError
 from petfsi.geometry.shapes import TOLERANCE, bounds
-from petfsi.scene.fluids import GridInflowSide, MacFluid
+from petfsi.scene.fluids import MacFluid
 from petfsi.scene.shape_checks import OPPOSITE, images, periods
+from petfsi.scene.sides import GridInflowSide
 from petfsi.scene.tables import Cylinder, Shape
 
 #: Parts of faces nearer than this to 0 or 1 are 0 or 1, besides what rounding makes of the coordinates.

@@ -15,7 +15,7 @@ from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, simplices
 from petfsi.messages import shown
-from petfsi.scene.schema import Solid, Tagged
+from petfsi.scene.solids import Solid, Tagged
 from petfsi.scene.tables import Shape
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from petfsi.messages import shown
 from petfsi.runs.plan_fluids import ENTRY_BYTES, KRYLOV_VECTORS, PRECONDITIONER, grid_bytes
 from petfsi.scene.beam_checks import corners
 from petfsi.scene.fluids import MacFluid, SphFluid
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Shape
 
 #: Resident memory of a rank before it holds anything (Python, NumPy, PETSc, compiled kernels), bytes.

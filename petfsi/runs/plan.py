@@ -17,7 +17,8 @@ from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.runs.memory import PROGRAM_BYTES, as_bytes, available_bytes, needs, solid_bytes
 from petfsi.runs.plan_fluids import fluid_plan, fluid_skipped
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
+from petfsi.scene.solids import Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.solving import options
 

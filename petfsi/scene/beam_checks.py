@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import Problems, length
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Beam
 
 #: Settings of a solid that say nothing about a beam; they must keep their defaults.

@@ -16,22 +16,13 @@ from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.fluids import (
-    Fluid,
-    GridInflow,
-    Inflow,
-    InflowSide,
-    MacFluid,
-    MovingSide,
-    PressureSide,
-    open_side,
-)
+from petfsi.scene.fluids import Fluid, MacFluid
 from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.particle_checks import particles
 from petfsi.scene.probe_checks import probes
 from petfsi.scene.scale_checks import scales
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import (
     NO_Z,
     OPPOSITE,
@@ -50,6 +41,8 @@ from petfsi.scene.shape_checks import (
     solid_shape,
 )
 from petfsi.scene.side_checks import grid_sides
+from petfsi.scene.sides import GridInflow, Inflow, InflowSide, MovingSide, PressureSide, open_side
+from petfsi.scene.solids import Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Halfspace
 
@@ -89,7 +82,7 @@ def check_inside_grid(scene: Scene, key: str, points: np.ndarray) -> None:
 
 def _contents(scene: Scene) -> Problems:
     if scene.fluid is None and not scene.solids:
-        yield Problem("fluid", ABSENT, "the scene needs a [fluid], or at least one [solids.<name>]", ("solids",))
+        yield Problem("fluid", ABSENT, "the scene needs a [fluid], or at least one [solids.NAME]", ("solids",))
     if scene.fluid is None and scene.obstacles:
         names = ", ".join(scene.obstacles)
         yield Problem("obstacles", names, "only a fluid feels obstacles, and the scene has no [fluid]", ("fluid",))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from petfsi.scene.mistakes import ABSENT, Problem
-from petfsi.scene.schema import Load, Solid, Tagged
 from petfsi.scene.shape_checks import NO_Z, OPPOSITE, Problems, analytic_shape, length
+from petfsi.scene.solids import Load, Solid, Tagged
 from petfsi.scene.tables import Shape
 
 

@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import copy
 import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_origin
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from petfsi.messages import shown
+from petfsi.scene.keys import every_key, is_form, is_model, kind_of, settings, walk
 from petfsi.scene.schema import Scene
 
 #: No value stands at the key.
 ABSENT = object()
 #: Characters of a key that are shown.
 LONGEST = 100
+#: What numbers must be, by pydantic's names of bounds.
+BOUNDS = {
+    "gt": "greater than {:g}",
+    "ge": "{:g} or more",
+    "lt": "less than {:g}",
+    "le": "{:g} or less",
+    "multiple_of": "a multiple of {:g}",
+}
+#: How much alike names of different tables must be, from 0 to 1, for one to be taken for the other.
+ALIKE = 0.75
 
 
 @dataclass(frozen=True)
@@ -66,11 +77,11 @@ def shorten(value: Any) -> str:
 def describe(entry: Mapping[str, Any]) -> Problem:
     """Return pydantic's finding as a problem."""
     loc = [part for part in entry["loc"] if not str(part).startswith("[")]
-    key = ".".join(str(part) for part in loc if not _is_form(part))
+    key = ".".join(str(part) for part in loc if not is_form(part))
     field = _field(loc)
     value = ABSENT if entry["type"] == "missing" or entry["loc"][-1] == "[key]" else entry["input"]
     if entry["type"] == "extra_forbidden":
-        return Problem(key, value, _unknown(loc))
+        return Problem(key, value, unknown(loc))
     allowed = _allowed(entry)
     unit = f" ({field.description})" if field is not None and field.description else ""
     return Problem(key, value, allowed + unit)
@@ -78,6 +89,9 @@ def describe(entry: Mapping[str, Any]) -> Problem:
 
 def _allowed(entry: Mapping[str, Any]) -> str:
     context = entry.get("ctx", {})
+    for bound, words in BOUNDS.items():
+        if bound in context:
+            return f"must be {words.format(context[bound])}"
     match entry["type"]:
         case "missing":
             return "is missing"
@@ -97,103 +111,49 @@ def _allowed(entry: Mapping[str, Any]) -> str:
             return "must be a table"
         case "literal_error":
             return f"must be {context['expected']}"
-        case "greater_than":
-            return f"must be greater than {context['gt']:g}"
-        case "greater_than_equal":
-            return f"must be {context['ge']:g} or more"
-        case "less_than":
-            return f"must be less than {context['lt']:g}"
-        case "less_than_equal":
-            return f"must be {context['le']:g} or less"
-        case "multiple_of":
-            return f"must be a multiple of {context['multiple_of']:g}"
         case "too_short" | "string_too_short":
             return "must not be empty"
     return entry["msg"]
 
 
-def _is_form(part: Any) -> bool:
-    """Whether a part of a path tells which form of a table is meant, and is no key."""
-    return str(part).startswith("<")
+def unknown(loc: list[Any]) -> str:
+    """Say that there is no such setting, and which one may be meant: beside it, or else in another table.
 
-
-def _unknown(loc: list[Any]) -> str:
-    """Say that there is no such setting, and which one may be meant: beside it, or else in another table."""
+    Parameters
+    ----------
+    loc : list of str or int
+        The path of the setting, with pydantic's forms of tables or without; that of its table is sound.
+    """
     name, table = str(loc[-1]), _model(loc[:-1])
     given = shown(name)
-    fields = _settings(table) if table is not None else {}
-    others = _walk([part for part in loc[:-1] if not _is_form(part)])[0]
-    kinds = [kind for kind in others if _is_model(kind) and "kind" in _settings(kind)]
-    having = [kind.form.strip("<>") for kind in kinds if name in _settings(kind)]
+    fields = settings(table) if table is not None else {}
+    path = tuple(part for part in loc if not is_form(part))
+    kinds = [kind for kind in walk(list(path[:-1]))[0] if is_model(kind) and kind_of(kind)]
+    having = [kind_of(kind) for kind in kinds if name in settings(kind)]
     if having:
         return f"belongs to kind = {' and '.join(having)}; known here are {', '.join(fields)}"
     near = difflib.get_close_matches(name, fields, 1)
     if near:
         unit = fields[near[0]].description
         return f"no setting '{given}'; did you mean '{near[0]}'" + (f" ({unit})?" if unit else "?")
-    elsewhere = [path for path in _every_setting(Scene) if path[-1] == name]
-    if tuple(part for part in loc if not _is_form(part)) in elsewhere:  # of another form of this table
+    everywhere = {key.path: key.path[-1] for key in every_key()}
+    if path in everywhere:  # of another form of this table
         return f"does not belong here; known here are {', '.join(fields)}"
-    if elsewhere and len(elsewhere[0]) == 1:
+    if (name,) in everywhere:
         return f"no setting '{given}' here; it stands at the top of the scene, before any [table]"
-    if elsewhere:
-        return f"no setting '{given}' here; did you mean '{'.'.join(elsewhere[0])}'?"
+    alike = difflib.get_close_matches(name, dict.fromkeys(everywhere.values()), 1, ALIKE)
+    if alike:
+        elsewhere = next(path for path, last in everywhere.items() if last in alike)
+        return f"no setting '{given}' here; did you mean '{'.'.join(elsewhere)}'?"
     return f"no setting '{given}'; known here are {', '.join(fields)}"
 
 
-def _settings(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a table as a scene spells them."""
-    return {field.alias or name: field for name, field in model.model_fields.items()}
-
-
-def _every_setting(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    for name, field in _settings(model).items():
-        yield (*path, name)
-        for part in _parts(field.annotation):
-            named = get_origin(part) is dict
-            for inner in _parts(get_args(part)[1]) if named else [part]:
-                if _is_model(inner):
-                    yield from _every_setting(inner, (*path, name, "<name>") if named else (*path, name))
-
-
-def _is_model(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _parts(annotation: Any) -> list[Any]:
-    """Return the members of a union, the annotation itself otherwise, bare of ``Annotated``."""
-    if get_origin(annotation) is Annotated:
-        return _parts(get_args(annotation)[0])
-    if get_origin(annotation) in (dict, list) or not get_args(annotation):
-        return [annotation]
-    return [inner for part in get_args(annotation) for inner in _parts(part)]
-
-
-def _walk(loc: list[Any]) -> tuple[list[Any], FieldInfo | None]:
-    """Follow a path through the models: what may stand there, and the last field passed."""
-    here: list[Any] = [Scene]
-    field: FieldInfo | None = None
-    for part in loc:
-        following: list[Any] = []
-        if _is_form(part):
-            here = [kind for kind in here if getattr(kind, "form", part) == part]
-            continue
-        for kind in here:
-            if _is_model(kind) and part in _settings(kind):
-                field = _settings(kind)[part]
-                following += _parts(field.annotation)
-            elif get_origin(kind) in (dict, list):
-                following += _parts(get_args(kind)[-1])
-        here = following
-    return here, field
-
-
 def _field(loc: list[Any]) -> FieldInfo | None:
-    return _walk(loc)[1]
+    return walk(loc)[1]
 
 
 def _model(loc: list[Any]) -> type[BaseModel] | None:
-    return next((kind for kind in _walk(loc)[0] if _is_model(kind)), None)
+    return next((kind for kind in walk(loc)[0] if is_model(kind)), None)
 
 
 # ---- going on -----------------------------------------------------------------------------------------------

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from petfsi.scene.fluids import InflowSide, MovingSide, SphFluid
+from petfsi.scene.fluids import SphFluid
 from petfsi.scene.mistakes import Problem
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import MAX_CELLS, OPPOSITE, is_measured, length, periods, plain_shape
+from petfsi.scene.sides import InflowSide, MovingSide
 
 #: Particles see so many smoothing lengths far, and lists of pairs a little farther.
 REACH = 2.1

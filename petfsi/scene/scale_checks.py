@@ -15,8 +15,9 @@ from pydantic import BaseModel
 from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.fluids import Fluid, SphFluid
 from petfsi.scene.mistakes import Problem
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import Problems, extent, is_measured
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Halfspace, Shape
 
 #: No number may be larger, nor a positive one smaller: products of a few of them must not overflow.

@@ -1,7 +1,8 @@
 """What a scene may say: one frozen model per table, SI units, unknown keys refused.
 
 The models judge one key at a time; what needs several keys at once stands in ``checks.py``. A field's description
-is its unit or a few words on what is meant, and ends up in error messages.
+is its unit or a few words on what is meant, and ends up in error messages. What a key means stands beside it as ``Doc``
+(PEP 727), for ``petfsi help``: a first sentence that fits on a line, then more, and what is so where it is left out.
 """
 
 from __future__ import annotations
@@ -9,31 +10,65 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, PrivateAttr, Tag, field_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, field_validator
 from pydantic_core import PydanticCustomError
+from typing_extensions import Doc
 
-from petfsi.registry import COUPLINGS, INTEGRATORS, MATERIALS
+from petfsi.registry import COUPLINGS, INTEGRATORS
 from petfsi.scene.fluids import Fluid
-from petfsi.scene.tables import Flag, Number, Real, Shape, Table, Vector, Whole, one_of
+from petfsi.scene.solids import Solid
+from petfsi.scene.tables import Flag, Number, OneOf, Real, Shape, Table, Vector, Whole
 
 if TYPE_CHECKING:
     from petfsi.integrators.base import Integrator
-
-Component = Literal["x", "y", "z", "angle"]
-Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
 
 
 class Time(Table):
     """When the run ends and how it steps."""
 
-    end: Annotated[Real, Field(gt=0, description="s")]
-    dt: Annotated[Number, Field(description="s")]
-    integrator: Annotated[str, BeforeValidator(one_of(INTEGRATORS))] = "bdf2"
+    end: Annotated[
+        Real,
+        Field(gt=0, description="s"),
+        Doc(
+            "When the run ends. It begins at t = 0; where whole steps would pass its end, the last two share what is left."
+        ),
+    ]
+    dt: Annotated[
+        Number,
+        Field(description="s"),
+        Doc(
+            'How long a step is: a number, an expression of t, or "auto". "auto" is nine tenths of the stable step of '
+            "what is explicit, particles or symplectic-euler."
+        ),
+    ]
+    integrator: Annotated[
+        str,
+        BeforeValidator(OneOf(INTEGRATORS)),
+        Doc(
+            "The scheme in time, of fluid and solids alike. newmark: as published, of first order; bdf2: of second "
+            "order, damps what is too fast for the step; midpoint: of second order, damps nothing; symplectic-euler: "
+            "explicit for solids, with steps up to 2/omega; static: the equilibrium of solids under their loads, "
+            "without inertia."
+        ),
+    ] = "bdf2"
     above_limit: Annotated[
-        Literal["refuse", "subcycle"], Field(description="what becomes of steps above an explicit scheme's stable one")
+        Literal["refuse", "subcycle"],
+        Field(description="what becomes of steps above an explicit scheme's stable one"),
+        Doc("Whether steps above the stable one of what is explicit are refused or divided."),
     ] = "refuse"
-    retries: Annotated[Whole, Field(ge=0, le=20, description="how often a step that fails is halved")] = 3
-    energy_limit: Annotated[Real, Field(description="part of its energy that may come out of nothing; -1: any")] = 1.0
+    retries: Annotated[
+        Whole,
+        Field(ge=0, le=20, description="how often a step that fails is halved"),
+        Doc("How often a step that fails is halved. It is taken again in halves, these in halves, and so on."),
+    ] = 3
+    energy_limit: Annotated[
+        Real,
+        Field(description="part of its energy that may come out of nothing; -1: any"),
+        Doc(
+            "A run stops once it holds more by this part than it can have got. -1: it never does; wants "
+            "output.accounts."
+        ),
+    ] = 1.0
 
     @property
     def scheme(self) -> Integrator:
@@ -57,162 +92,94 @@ class Time(Table):
         return dt
 
 
-# ---- solids -------------------------------------------------------------------------------------------------
-
-
-class Damping(Table):
-    """Rayleigh damping C = mass * M + stiffness * K'."""
-
-    mass: Annotated[Real, Field(ge=0, description="1/s")] = 0.0
-    stiffness: Annotated[Real, Field(ge=0, description="s")] = 0.0
-
-
-class Tagged(Table):
-    """A group of boundary facets or of nodes that a mesh file has a name (or a number) for."""
-
-    tag: Annotated[str, Field(min_length=1, description="the name of a group of facets or nodes in the mesh file")]
-
-
-def _where_form(value: Any) -> str:
-    if isinstance(value, Tagged) or (isinstance(value, dict) and "tag" in value):
-        return "<tag>"
-    return "<table>" if isinstance(value, dict | Shape) else "<name>"
-
-
-#: A side of the solid's bounding box (left, right, bottom, top, back, front), all, the start or end of a beam, a shape
-#: or a mesh file's tag.
-Where = Annotated[
-    Annotated[Place, Tag("<name>")] | Annotated[Shape, Tag("<table>")] | Annotated[Tagged, Tag("<tag>")],
-    Discriminator(_where_form),
-]
-_WHERE = "or a shape such as { box = { origin = ..., size = ... } }, or { tag = ... } of a mesh file"
-
-
-class Support(Table):
-    """Nodes whose motion is prescribed: at rest, unless a velocity or a displacement is given."""
-
-    where: Annotated[Where, Field(description=_WHERE)]
-    fix: Annotated[list[Component], Field(min_length=1, description="axes that are held; of a beam its angle, too")]
-    velocity: Annotated[
-        dict[Component, Number], Field(description="m/s of fixed axes, rad/s; may depend on x, y, z, t")
-    ] = {}
-    displacement: Annotated[
-        dict[Component, Number], Field(description="m of fixed axes, rad; may depend on x, y, z, t")
-    ] = {}
-
-
-class Load(Table):
-    """A traction or a pressure on boundary facets, or a force at a point. x, y, z are reference positions."""
-
-    where: Annotated[Where | None, Field(description=_WHERE)] = None
-    traction: Annotated[list[Number] | None, Field(description="N/m^2 of reference area; may depend on x, y, z, t")] = (
-        None
-    )
-    pressure: Annotated[Number | None, Field(description="Pa; may depend on x, y, z, t")] = None
-    follower: Annotated[Flag | None, Field(description="whether it turns with the facets")] = None
-    at: Annotated[Vector | None, Field(description="m, where the point is at rest")] = None
-    force: Annotated[list[Number] | None, Field(description="N; may depend on x, y, z, t")] = None
-    moment: Annotated[Number | None, Field(description="N m, on a beam; may depend on x, y, t")] = None
-
-    @property
-    def kinds(self) -> list[str]:
-        """Which loads are given; a valid table names one, a moment being a force or part of one."""
-        kinds = [kind for kind in ("traction", "pressure", "force") if getattr(self, kind) is not None]
-        return kinds if self.moment is None or "force" in kinds else [*kinds, "force"]
-
-    @property
-    def follows(self) -> bool:
-        """Whether it turns with the facets; unless told otherwise a pressure does and a traction does not."""
-        return self.pressure is not None if self.follower is None else self.follower
-
-
-class SolidInitial(Table):
-    """The solid at time zero."""
-
-    velocity: Annotated[list[Number] | None, Field(description="m/s; may depend on x, y, z")] = None
-    displacement: Annotated[list[Number] | None, Field(description="m; may depend on x, y, z")] = None
-
-
-class Solid(Table):
-    """A deformable body of linear triangles or tetrahedra."""
-
-    shape: Shape
-    density: Annotated[Real, Field(gt=0, description="kg/m^3")]
-    young: Annotated[Real, Field(gt=0, description="Pa")]
-    poisson: Annotated[Real, Field(gt=-1, lt=0.5)]
-    material: Annotated[str, BeforeValidator(one_of(MATERIALS))] = "green"
-    tangent: Annotated[
-        Literal["exact", "projected"], Field(description="projected: without each element's negative eigenvalues")
-    ] = "exact"
-    elements: Annotated[Literal["linear", "quadratic"], Field(description="order of the shape functions")] = "linear"
-    volumetric: Annotated[
-        Literal["full", "reduced"], Field(description="integration of lambda's part; reduced does not lock")
-    ] = "full"
-    mass: Literal["consistent", "lumped"] = "consistent"
-    interior: Literal["fluid", "void"] = "fluid"
-    damping: Damping = Damping()
-    supports: list[Support] = []
-    body_force: Annotated[
-        list[Number] | None, Field(description="N/m^3 of reference volume; may depend on x, y, z, t")
-    ] = None
-    loads: list[Load] = []
-    initial: SolidInitial = SolidInitial()
-
-
 class Obstacle(Table):
-    """A static rigid shape; ``outside`` turns it into a container."""
+    """A rigid shape that stands still; feels nothing, and is felt by the fluid alone."""
 
-    shape: Shape
-    outside: Flag = False
-
-
-# ---- the rest -----------------------------------------------------------------------------------------------
+    shape: Annotated[Shape, Doc("A box, ball, cylinder, halfspace, or a mesh file.")]
+    outside: Annotated[Flag, Doc("Whether it is all but the shape: a container.")] = False
 
 
 class Coupling(Table):
     """How fluid and solids are joined."""
 
-    transfer: Annotated[str | None, BeforeValidator(one_of(COUPLINGS, optional=True))] = None
-    #: Facets are split until their pieces are about a cell / quadrature.
-    quadrature: Annotated[Whole, Field(ge=1, le=4)] = 2
+    transfer: Annotated[
+        str | None,
+        BeforeValidator(OneOf(COUPLINGS, optional=True)),
+        Doc(
+            "How they act on each other. A grid has cutcell or ray (as published), particles have pressure or "
+            "repulsion. Left out, it is cutcell or pressure, as suits the kind of fluid."
+        ),
+    ] = None
+    quadrature: Annotated[
+        Whole, Field(ge=1, le=4), Doc("With ray, facets are split until pieces are about a cell over this.")
+    ] = 2
 
 
 class Probe(Table):
     """A quantity written to every row of history.csv."""
 
-    of: Annotated[str, Field(description="a solid's name, fluid, or what a force is on")]
-    at: Annotated[Vector | None, Field(description="m; in a solid, where the point is at rest")] = None
-    quantity: Literal["displacement", "velocity", "angle", "pressure", "smoke", "front", "level", "force"]
+    of: Annotated[
+        str,
+        Field(description="a solid's name, fluid, or what a force is on"),
+        Doc('What is asked: a solid by its name, "fluid", or what feels a force. That is a side or an obstacle.'),
+    ]
+    at: Annotated[
+        Vector | None,
+        Field(description="m; in a solid, where the point is at rest"),
+        Doc("Where it is asked. Left out of front and force."),
+    ] = None
+    quantity: Annotated[
+        Literal["displacement", "velocity", "angle", "pressure", "smoke", "front", "level", "force"],
+        Doc(
+            "What is written. Solids have displacement and velocity, beams angle, too; a fluid has velocity and "
+            "pressure, on a grid smoke, of particles front (the largest x of liquid), level (its height at a point) "
+            "and force (on a side or an obstacle)."
+        ),
+    ]
 
 
 class Output(Table):
-    """When fields are written (none means never), and whether history.csv accounts for momentum, energy and volumes."""
+    """What is written for pictures, and into history.csv."""
 
-    every: Annotated[Annotated[Real, Field(gt=0)] | None, Field(description="s")] = None
-    accounts: bool = True
+    every: Annotated[
+        Annotated[Real, Field(gt=0)] | None,
+        Field(description="s"),
+        Doc("The time from one output of all fields to the next. Left out, none is written."),
+    ] = None
+    accounts: Annotated[bool, Doc("Whether history.csv accounts for volumes, momentum and energy.")] = True
 
 
 class Checkpoint(Table):
     """When checkpoints are written and how many stay."""
 
-    every: Annotated[Annotated[Real, Field(gt=0)] | None, Field(description="s of scene time")] = None
-    keep: Annotated[Whole, Field(ge=1)] = 3
+    every: Annotated[
+        Annotated[Real, Field(gt=0)] | None,
+        Field(description="s of scene time"),
+        Doc("The time from one checkpoint to the next. Left out, one is written at the end alone."),
+    ] = None
+    keep: Annotated[Whole, Field(ge=1), Doc("How many of the newest checkpoints stay.")] = 3
 
 
 class Scene(Table):
     """A whole scene."""
 
-    title: str = ""
-    dim: Literal[2, 3]
-    gravity: Annotated[list[Number] | None, Field(description="m/s^2; may depend on t")] = None
-    time: Time
-    fluid: Fluid | None = None
-    solids: dict[str, Solid] = {}
-    obstacles: dict[str, Obstacle] = {}
-    coupling: Coupling = Coupling()
-    probes: dict[str, Probe] = {}
-    output: Output = Output()
-    checkpoint: Checkpoint = Checkpoint()
+    title: Annotated[str, Doc("What the log calls the run.")] = ""
+    dim: Annotated[Literal[2, 3], Doc("The number of axes. In 2D all is per metre of thickness.")]
+    gravity: Annotated[
+        list[Number] | None,
+        Field(description="m/s^2; may depend on t"),
+        Doc("The acceleration of gravity, per axis. Left out, there is none."),
+    ] = None
+    time: Annotated[Time, Doc("When the run ends and how it steps.")]
+    fluid: Annotated[Fluid | None, Doc("The fluid: on a grid, or of particles. Left out, there are solids alone.")] = (
+        None
+    )
+    solids: Annotated[dict[str, Solid], Doc("Deformable bodies, any number, each by a name.")] = {}
+    obstacles: Annotated[dict[str, Obstacle], Doc("Rigid shapes that stand still, any number, each by a name.")] = {}
+    coupling: Annotated[Coupling, Doc("How fluid and solids are joined.")] = Coupling()
+    probes: Annotated[dict[str, Probe], Doc("Columns of history.csv, any number, each by a name.")] = {}
+    output: Annotated[Output, Doc("What is written for pictures, and into history.csv.")] = Output()
+    checkpoint: Annotated[Checkpoint, Doc("When checkpoints are written and how many stay.")] = Checkpoint()
 
     _directory: Path = PrivateAttr(default=Path())
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from petfsi.scene.fluids import Fluid, HydrostaticSide, PressureSide
+from petfsi.scene.fluids import Fluid
 from petfsi.scene.mistakes import ABSENT, Problem
+from petfsi.scene.sides import HydrostaticSide, PressureSide
 from petfsi.scene.tables import Box, Shape
 
 #: PETSc numbers unknowns with 32 bits.

@@ -6,10 +6,11 @@ import itertools
 
 import numpy as np
 
-from petfsi.scene.fluids import GridInflow, HydrostaticSide, InflowSide, MacFluid
+from petfsi.scene.fluids import MacFluid
 from petfsi.scene.mistakes import Problem
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import OPPOSITE, SLACK, Problems, extent, images, is_measured, length, periods
+from petfsi.scene.sides import GridInflow, HydrostaticSide, InflowSide
 from petfsi.scene.tables import Shape
 
 

@@ -7,9 +7,10 @@ from contextlib import suppress
 import numpy as np
 
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.fluids import GridInflowSide, MacFluid
+from petfsi.scene.fluids import MacFluid
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import OPPOSITE, periods
+from petfsi.scene.sides import GridInflowSide
 
 #: Gravity that changes is looked at this often.
 INSTANTS = 11

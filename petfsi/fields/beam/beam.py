@@ -27,7 +27,8 @@ from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType
 from petfsi.ranks import on_root
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
+from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Beam
 
 #: What a node's unknowns are called in the scene.

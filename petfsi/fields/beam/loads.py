@@ -16,7 +16,7 @@ from petfsi.geometry.beams import axis_mesh
 from petfsi.geometry.places import located_facets
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Load, Solid
+from petfsi.scene.solids import Load, Solid
 from petfsi.scene.tables import Number
 
 #: Gauss points of an element: exact to degree 5.

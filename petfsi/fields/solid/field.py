@@ -32,7 +32,8 @@ from petfsi.integrators.base import Motion, Stage, moved, relinearised
 from petfsi.petsc import Layout, new_block, set_csr
 from petfsi.ranks import on_root
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
+from petfsi.scene.solids import Solid
 from petfsi.scene.stepping import Stepping
 from petfsi.scene.tables import Number
 

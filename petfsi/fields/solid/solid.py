@@ -24,7 +24,8 @@ from petfsi.geometry.surfaces import Surface, boundary_facets, shells, signed_vo
 from petfsi.petsc import IntType
 from petfsi.ranks import on_root
 from petfsi.registry import INVERTIBLE
-from petfsi.scene.schema import Scene, Solid
+from petfsi.scene.schema import Scene
+from petfsi.scene.solids import Solid
 
 
 class SimplexSolid(NodalSolid):

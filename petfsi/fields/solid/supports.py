@@ -14,7 +14,7 @@ from petfsi.geometry.places import Tags, located
 from petfsi.integrators.base import Integrator, Motion, Stage
 from petfsi.petsc import Layout
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Solid
+from petfsi.scene.solids import Solid
 
 #: Fraction of the first step over which the initial velocity of a prescribed displacement is measured.
 INSTANT = 1e-3

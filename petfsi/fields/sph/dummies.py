@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 
 from petfsi.fields.sph.solids import SAME, Array, Solid, build_solids
 from petfsi.geometry.shapes import inside
-from petfsi.scene.fluids import InflowSide
 from petfsi.scene.schema import Obstacle
+from petfsi.scene.sides import InflowSide
 
 SIDES = ("left", "right", "bottom", "top", "back", "front")
 #: Cells of the fine lattice along dx, by dimension.

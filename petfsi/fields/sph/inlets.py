@@ -18,8 +18,8 @@ from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.solids import SAME, Array
 from petfsi.geometry.shapes import inside
 from petfsi.scene.expressions import Expression, evaluate_at, ramp
-from petfsi.scene.fluids import Inflow, InflowSide
 from petfsi.scene.shape_checks import OPPOSITE
+from petfsi.scene.sides import Inflow, InflowSide
 
 #: At so many times the speed is asked for to find the fastest.
 SAMPLES = 101

@@ -9,8 +9,9 @@ import numpy as np
 from petfsi.fields.sph.dummies import Domain
 from petfsi.fields.sph.solids import Array
 from petfsi.scene.expressions import Expression, evaluate_at
-from petfsi.scene.fluids import MovingSide, SphFluid
+from petfsi.scene.fluids import SphFluid
 from petfsi.scene.shape_checks import OPPOSITE
+from petfsi.scene.sides import MovingSide
 
 #: The largest speed is looked for at so many times, and at so many points along each axis.
 TIMES, POINTS = 101, 33

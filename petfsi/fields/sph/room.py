@@ -14,9 +14,9 @@ from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.particles import Swarm
 from petfsi.geometry.shapes import inside
 from petfsi.scene import fluids
-from petfsi.scene.fluids import InflowSide
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import OPPOSITE
+from petfsi.scene.sides import InflowSide, at_rest
 
 #: The grid of cells goes so many reaches beyond the box: wall particles and those that leave must have a cell.
 MARGIN = 2.0
@@ -61,7 +61,7 @@ class Room:
         assert isinstance(fluid, fluids.SphFluid)
         low = np.array(fluid.origin, dtype=float)
         high = low + fluid.size
-        forms = [[fluids.at_rest(getattr(fluid.sides, side)) for side in pair] for pair in OPPOSITE[: scene.dim]]
+        forms = [[at_rest(getattr(fluid.sides, side)) for side in pair] for pair in OPPOSITE[: scene.dim]]
         sides = [(lower, upper) for lower, upper in forms]
         periodic = np.array([pair == ("periodic", "periodic") for pair in sides])
         reach = 2.0 * law.s

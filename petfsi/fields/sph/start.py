@@ -20,6 +20,7 @@ from petfsi.scene import fluids, particle_checks
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Obstacle, Scene
 from petfsi.scene.shape_checks import OPPOSITE
+from petfsi.scene.sides import at_rest
 
 #: The sound speed is so many times the fastest flow, so that density varies by one in a hundred.
 MACH = 10.0
@@ -67,8 +68,7 @@ class Start:
         self._scene, self._fluid = scene, fluid
         low = np.array(fluid.origin, dtype=float)
         sides = tuple(
-            (fluids.at_rest(getattr(fluid.sides, a)), fluids.at_rest(getattr(fluid.sides, b)))
-            for a, b in OPPOSITE[: scene.dim]
+            (at_rest(getattr(fluid.sides, a)), at_rest(getattr(fluid.sides, b))) for a, b in OPPOSITE[: scene.dim]
         )
         self._domain = Domain(low, low + fluid.size, sides)
         solid = scene.obstacles | _bodies(scene)

@@ -15,9 +15,10 @@ from petfsi.geometry.openings import check_jets, jet_parts
 from petfsi.geometry.shapes import bounds, inside
 from petfsi.ranks import agreed, on_root
 from petfsi.scene.expressions import Expression, evaluate_at, ramp
-from petfsi.scene.fluids import GridInflow, GridInflowSide, MacFluid, Side, Sides, open_side
+from petfsi.scene.fluids import MacFluid
 from petfsi.scene.schema import Obstacle
 from petfsi.scene.shape_checks import images
+from petfsi.scene.sides import GridInflow, GridInflowSide, Side, Sides, open_side
 from petfsi.scene.tables import Shape
 
 T = TypeVar("T")

@@ -27,7 +27,7 @@ from petfsi.fields.mac.grid.sides import NAMES, wrapped_points
 from petfsi.fields.mac.walls.parts import Parts
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression, evaluate_at
-from petfsi.scene.fluids import GridInflowSide, OpenSide, Sides, open_side
+from petfsi.scene.sides import GridInflowSide, OpenSide, Sides, open_side
 
 
 @dataclass

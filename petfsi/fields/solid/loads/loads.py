@@ -21,7 +21,7 @@ from petfsi.geometry.quadratic import facets_with_middles
 from petfsi.geometry.surfaces import boundary_facets
 from petfsi.ranks import agreed
 from petfsi.scene.expressions import Expression
-from petfsi.scene.schema import Load, Solid
+from petfsi.scene.solids import Load, Solid
 from petfsi.scene.tables import Number
 
 #: Gauss points along an axis of a facet: exact to degree 5.
