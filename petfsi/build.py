@@ -16,7 +16,7 @@ def build_fields(comm: MPI.Comm, scene: Scene) -> list[Field]:
     if scene.solids:
         fields.append(_build_solid(comm, scene))
     if scene.fluid:
-        fields.append(find(FLUIDS[scene.fluid.kind])(comm, scene))
+        fields.append(find(FLUIDS[scene.fluid.kind].field)(comm, scene))
     return fields
 
 
@@ -33,5 +33,6 @@ def build_couplings(scene: Scene, fields: list[Field]) -> list[Coupling]:
     """Return the couplings between the scene's fields. Collective."""
     if len(fields) < 2:
         return []
+    assert scene.fluid is not None
     solid, fluid = fields
-    return [find(COUPLINGS[scene.transfer])(fluid, solid, scene.coupling)]
+    return [find(COUPLINGS[scene.fluid.kind][scene.transfer])(fluid, solid, scene.coupling)]

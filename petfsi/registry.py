@@ -3,17 +3,42 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class FluidKind(NamedTuple):
+    """Where a kind of fluid has its field, its table in a scene, its part of the plan, and what it has no need of."""
+
+    field: str
+    table: str
+    plan: str
+    skipped: str
+
 
 FLUIDS = {
-    "mac": "petfsi.fields.mac.fluid:MacFluid",
-    "sph": "petfsi.fields.sph.fluid:SphFluid",
+    "mac": FluidKind(
+        "petfsi.fields.mac.fluid:MacFluid",
+        "petfsi.scene.fluids:MacFluid",
+        "petfsi.runs.plan_fluids:grid_plan",
+        "petfsi.runs.plan_fluids:grid_skipped",
+    ),
+    "sph": FluidKind(
+        "petfsi.fields.sph.fluid:SphFluid",
+        "petfsi.scene.fluids:SphFluid",
+        "petfsi.runs.plan_fluids:particle_plan",
+        "petfsi.runs.plan_fluids:particle_skipped",
+    ),
 }
+#: By the kind of fluid, the default first.
 COUPLINGS = {
-    "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
-    "ray": "petfsi.couplings.ray:RayCoupling",
-    "pressure": "petfsi.couplings.particles:PressureTransfer",
-    "repulsion": "petfsi.couplings.repulsion:RepulsionTransfer",
+    "mac": {
+        "cutcell": "petfsi.couplings.cutcell:CutCellCoupling",
+        "ray": "petfsi.couplings.ray:RayCoupling",
+    },
+    "sph": {
+        "pressure": "petfsi.couplings.particles:PressureTransfer",
+        "repulsion": "petfsi.couplings.repulsion:RepulsionTransfer",
+    },
 }
 INTEGRATORS = {
     "newmark": "petfsi.integrators.newmark:Newmark",

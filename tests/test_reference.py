@@ -10,9 +10,10 @@ import pytest
 from processes import environment
 
 from petfsi.errors import InputError
-from petfsi.registry import COUPLINGS, FLUIDS, INTEGRATORS, MATERIALS
+from petfsi.registry import FLUIDS, INTEGRATORS, MATERIALS
 from petfsi.scene import reference
 from petfsi.scene.keys import every_key
+from petfsi.scene.schema import TRANSFERS
 
 ROOT = Path(__file__).parents[1]
 BLOCKS = re.findall(r"^```toml\n(.*?)^```", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
@@ -75,7 +76,7 @@ def test_every_key_of_a_scene_can_be_looked_up(scene):
 
 
 def test_what_a_registry_has_may_be_chosen():
-    for key, names in {"integrator": INTEGRATORS, "material": MATERIALS, "transfer": COUPLINGS, "kind": FLUIDS}.items():
+    for key, names in {"integrator": INTEGRATORS, "material": MATERIALS, "transfer": TRANSFERS, "kind": FLUIDS}.items():
         assert all(f"'{name}'" in reference.explain(key) for name in names)
 
 

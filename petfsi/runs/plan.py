@@ -193,7 +193,7 @@ def _solid_sizes(scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
         for name, obstacle in scene.obstacles.items()
         if obstacle.shape.mesh is not None
     ]
-    if scene.obstacles and scene.transfer == "cutcell":
+    if scene.obstacles and scene.cuts_cells:
         readers = [partial(obstacle_surfaces, scene)]
     for read in [lambda: meshes.update(build_bodies(scene)), *readers]:
         try:

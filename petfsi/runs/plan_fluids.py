@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
+from petfsi.registry import FLUIDS, find
 from petfsi.scene.fluids import MacFluid, SphFluid
 from petfsi.scene.schema import Scene
 from petfsi.scene.side_notes import side_notes
@@ -52,22 +52,25 @@ def fluid_plan(scene: Scene) -> FluidPlan:
     """Return the plan of a scene's fluid; an empty one without any. Not collective; may read mesh files."""
     if scene.fluid is None:
         return FluidPlan([], 0, 0.0, 0.0, [])
-    return PLANS[scene.fluid.kind](scene)
+    plan: FluidPlan = find(FLUIDS[scene.fluid.kind].plan)(scene)
+    return plan
 
 
 def fluid_skipped(scene: Scene) -> list[str]:
     """Return what is neither allocated nor assembled for a scene's fluid, and why."""
-    return [] if scene.fluid is None else SKIPPED[scene.fluid.kind](scene)
+    skipped: list[str] = [] if scene.fluid is None else find(FLUIDS[scene.fluid.kind].skipped)(scene)
+    return skipped
 
 
-def _mac(scene: Scene) -> FluidPlan:
+def grid_plan(scene: Scene) -> FluidPlan:
+    """Return what a fluid on a grid would take."""
     fluid, dim = scene.fluid, scene.dim
     assert isinstance(fluid, MacFluid)
     n = math.prod(fluid.cells)
     rows = [("pressure", f"{n:,} unknowns, one per cell of {' x '.join(map(str, fluid.cells))}")]
     rows += [("note", note) for note in side_notes(scene)]
     per_output = 8 * (dim + 2 + (fluid.smoke is not None))
-    return FluidPlan(rows, n, grid_bytes(fluid, dim), float(n * per_output), _mac_skipped(scene))
+    return FluidPlan(rows, n, grid_bytes(fluid, dim), float(n * per_output), grid_skipped(scene))
 
 
 def grid_bytes(fluid: MacFluid, dim: int) -> float:
@@ -77,7 +80,8 @@ def grid_bytes(fluid: MacFluid, dim: int) -> float:
     return float(math.prod(fluid.cells) * (arrays + matrix + 8 * KRYLOV_VECTORS))
 
 
-def _mac_skipped(scene: Scene) -> list[str]:
+def grid_skipped(scene: Scene) -> list[str]:
+    """Return what such a fluid has no need of."""
     fluid = scene.fluid
     assert isinstance(fluid, MacFluid)
     out = ["viscous terms: viscosity is 0"]
@@ -90,7 +94,8 @@ def _mac_skipped(scene: Scene) -> list[str]:
     return out
 
 
-def _sph(scene: Scene) -> FluidPlan:
+def particle_plan(scene: Scene) -> FluidPlan:
+    """Return what a fluid of particles would take."""
     from petfsi.fields.sph.start import Start
 
     assert isinstance(scene.fluid, SphFluid)
@@ -113,10 +118,11 @@ def _sph(scene: Scene) -> FluidPlan:
     size = n * (PARTICLE_BYTES[dim] + (unknowns > 0) * neighbours * (2 * dim * ENTRY_BYTES + 16))
     size += n_walls * PARTICLE_BYTES[dim]
     step = min(start.limits().values())
-    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), _sph_skipped(scene), step)
+    return FluidPlan(rows, unknowns, float(size), 8.0 * n * (2 * dim + 3), particle_skipped(scene), step)
 
 
-def _sph_skipped(scene: Scene) -> list[str]:
+def particle_skipped(scene: Scene) -> list[str]:
+    """Return what such a fluid has no need of."""
     from petfsi.fields.sph.start import Start
 
     fluid = scene.fluid
@@ -133,7 +139,3 @@ def _sph_skipped(scene: Scene) -> list[str]:
     if not scene.solids and not (fluid.viscosity > 0 and Start(scene).implicit):
         out.append("solver: particles are explicit, and nothing else is there; no option under -fsi_ is read")
     return out
-
-
-PLANS: dict[str, Callable[[Scene], FluidPlan]] = {"mac": _mac, "sph": _sph}
-SKIPPED: dict[str, Callable[[Scene], list[str]]] = {"mac": _mac_skipped, "sph": _sph_skipped}

@@ -16,7 +16,8 @@ from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.scene.beam_checks import beam_shape, beams, corners, is_sound
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.fluids import Fluid, MacFluid
+from petfsi.scene.fluid_kinds import Fluid
+from petfsi.scene.fluids import MacFluid
 from petfsi.scene.load_checks import place, solid_loads
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.particle_checks import particles
@@ -153,8 +154,11 @@ def _fluid(scene: Scene) -> Problems:
 
 
 def _transfer(scene: Scene) -> Problems:
-    if scene.fluid is not None and scene.transfer not in scene.fluid.transfers:
-        allowed = f"must be one of {', '.join(scene.fluid.transfers)} for fluid.kind = {scene.fluid.kind}"
+    if scene.fluid is None or (scene.coupling.transfer is None and not scene.solids):
+        return
+    if scene.transfer not in scene.fluid.transfers:
+        known = f"must be one of {', '.join(scene.fluid.transfers)}" if scene.fluid.transfers else "there is none"
+        allowed = f"{known} for fluid.kind = {scene.fluid.kind}"
         yield Problem("coupling.transfer", scene.transfer, allowed, ("fluid.kind",))
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 from pydantic_core import PydanticCustomError
 from typing_extensions import Doc
 
-from petfsi.registry import FLUIDS
+from petfsi.registry import COUPLINGS, FLUIDS
 from petfsi.scene.sides import ParticleSides, Sides
 from petfsi.scene.tables import Cells, Flag, Number, OneOf, Real, Shape, Table, Vector
+
+#: The kind of a fluid that does not say which it is.
+DEFAULT = "mac"
 
 
 class Smoke(Table):
@@ -37,11 +40,13 @@ class FluidInitial(Table):
 class FluidTable(Table):
     """What fluids of every kind say."""
 
+    form: ClassVar[str]
+
     kind: Annotated[
         str,
         BeforeValidator(OneOf(FLUIDS)),
         Doc("How the fluid is computed. mac: on a staggered grid, incompressible; sph: with particles."),
-    ] = "mac"
+    ] = DEFAULT
     density: Annotated[
         Real, Field(gt=0, description="kg/m^3"), Doc("Mass per volume; of particles where their pressure is 0.")
     ]
@@ -55,12 +60,16 @@ class FluidTable(Table):
     ]
     initial: Annotated[FluidInitial, Doc("The fluid at time zero.")] = FluidInitial()
 
+    @property
+    def transfers(self) -> tuple[str, ...]:
+        """How it may be joined to solids, the default first; empty where it cannot be."""
+        return tuple(COUPLINGS.get(self.kind, ()))
+
 
 class MacFluid(FluidTable):
     """An incompressible fluid on a regular staggered grid."""
 
     form: ClassVar[str] = "<mac>"
-    transfers: ClassVar[tuple[str, ...]] = ("cutcell", "ray")
 
     viscosity: Annotated[
         Real, Field(description="Pa s"), Doc("Must be 0: this version solves inviscid fluids on grids.")
@@ -92,7 +101,6 @@ class SphFluid(FluidTable):
     """A weakly compressible fluid of particles."""
 
     form: ClassVar[str] = "<sph>"
-    transfers: ClassVar[tuple[str, ...]] = ("pressure", "repulsion")
 
     spacing: Annotated[
         Real,
@@ -179,14 +187,3 @@ class SphFluid(FluidTable):
     def cells(self) -> None:
         """Particles have none."""
         return
-
-
-def _fluid_form(value: Any) -> str:
-    """Tell kinds of fluids apart, so that errors speak of one of them only."""
-    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return SphFluid.form if kind == "sph" else MacFluid.form
-
-
-Fluid = Annotated[
-    Annotated[MacFluid, Tag(MacFluid.form)] | Annotated[SphFluid, Tag(SphFluid.form)], Discriminator(_fluid_form)
-]

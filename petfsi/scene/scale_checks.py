@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from petfsi.scene.expressions import Expression, ExpressionError
-from petfsi.scene.fluids import Fluid, SphFluid
+from petfsi.scene.fluid_kinds import Fluid
+from petfsi.scene.fluids import SphFluid
 from petfsi.scene.mistakes import Problem
 from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import Problems, extent, is_measured

@@ -15,12 +15,17 @@ from pydantic_core import PydanticCustomError
 from typing_extensions import Doc
 
 from petfsi.registry import COUPLINGS, INTEGRATORS
-from petfsi.scene.fluids import Fluid
+from petfsi.scene.fluid_kinds import Fluid
+from petfsi.scene.fluids import MacFluid
 from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Flag, Number, OneOf, Real, Shape, Table, Vector, Whole
 
 if TYPE_CHECKING:
     from petfsi.integrators.base import Integrator
+
+
+#: The names of all transfers, of whatever kind of fluid.
+TRANSFERS = [name for transfers in COUPLINGS.values() for name in transfers]
 
 
 class Time(Table):
@@ -29,9 +34,7 @@ class Time(Table):
     end: Annotated[
         Real,
         Field(gt=0, description="s"),
-        Doc(
-            "When the run ends. It begins at t = 0; where whole steps would pass its end, the last two share what is left."
-        ),
+        Doc("When the run ends. It begins at t = 0; where whole steps would pass the end, the last two share it."),
     ]
     dt: Annotated[
         Number,
@@ -104,7 +107,7 @@ class Coupling(Table):
 
     transfer: Annotated[
         str | None,
-        BeforeValidator(OneOf(COUPLINGS, optional=True)),
+        BeforeValidator(OneOf(TRANSFERS, optional=True)),
         Doc(
             "How they act on each other. A grid has cutcell or ray (as published), particles have pressure or "
             "repulsion. Left out, it is cutcell or pressure, as suits the kind of fluid."
@@ -191,7 +194,13 @@ class Scene(Table):
     @property
     def transfer(self) -> str:
         """How fluid and solids are joined: as the scene says, else as suits the kind of fluid."""
-        return self.coupling.transfer or (self.fluid.transfers[0] if self.fluid is not None else "cutcell")
+        known = self.fluid.transfers if self.fluid is not None else ("cutcell",)
+        return self.coupling.transfer or next(iter(known), "none")
+
+    @property
+    def cuts_cells(self) -> bool:
+        """Whether walls cut the cells of a grid: for every transfer but that by rays, which stays as published."""
+        return isinstance(self.fluid, MacFluid) and self.transfer != "ray"
 
     @property
     def unjudged(self) -> str:

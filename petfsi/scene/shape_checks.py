@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from petfsi.scene.fluids import Fluid
+from petfsi.scene.fluid_kinds import Fluid
 from petfsi.scene.mistakes import ABSENT, Problem
 from petfsi.scene.sides import HydrostaticSide, PressureSide
 from petfsi.scene.tables import Box, Shape

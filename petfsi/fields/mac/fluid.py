@@ -90,8 +90,7 @@ class MacFluid(CoveredGrid):
         self._smoke_band = None if self.smoke is None else Band(grid, None)
         gravity: list[Number] = scene.gravity or [0.0] * grid.dim
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(gravity)]
-        # the ray transfer stays as it was published
-        exact = scene.transfer == "cutcell" and scene.gravity is not None
+        exact = scene.cuts_cells and scene.gravity is not None
         self.weight = Weight(grid, self.density, self._gravity) if exact else None
         self._uncover()
         self._start()

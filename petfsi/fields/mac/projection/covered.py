@@ -90,7 +90,7 @@ class CoveredGrid(PressureFluid):
         self.cell_volume, self.n_cells = grid.cell_volume, grid.layout.n_local
         self.surroundings = Surroundings(grid, fluid)
         self.open_sides = OpenSides(grid, fluid.density, fluid.sides)
-        self._cutter = self._make_cutter() if scene.transfer == "cutcell" else None
+        self._cutter = self._make_cutter() if scene.cuts_cells else None
         if self._cutter is None:
             for name, obstacle in scene.obstacles.items():
                 self.surroundings.add_obstacle(obstacle, f"obstacles.{name}", scene.directory)
