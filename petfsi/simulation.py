@@ -406,9 +406,15 @@ class Simulation:
             story = self.splitting.story()
             other = "Try monolithic.opts, which tells splitting from the physics, a smaller dt, or more damping."
             return f"{story[0].upper()}{story[1:]}." if story else other
-        if self.stable.limited or self.solver.iterates:
-            return "Try a smaller dt, or more damping."
-        return "Try a smaller dt, -fsi_snes_type newtonls, or more damping."
+        if self.scene.time.integrator == "static":
+            return "Try smaller steps of the load, by a smaller dt."
+        helps = ["a smaller dt"]
+        if self.solid is not None:
+            linear = self.solid.is_linear or self.solver.iterates or self.stable.limited
+            helps += [] if linear else ["-fsi_snes_type newtonls"]
+            helps += ["more damping"]
+            helps += ['time.integrator = "bdf2"'] if self.scene.time.integrator == "midpoint" else []
+        return f"Try {' or '.join(filter(None, [', '.join(helps[:-1]), helps[-1]]))}."
 
     def probe_columns(self) -> list[str]:
         """Return the names of the probes' columns in history.csv."""
