@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 from petfsi.errors import FinalError, NoSolutionError, SolveError, TouchError
 from petfsi.fields.base import SolidField
+from petfsi.solving.splitting import SplitWatch
 from petfsi.touch import WHY, Watch
 
 
@@ -61,3 +62,19 @@ def elements_named(solid: SolidField | None) -> Iterator[None]:
         if not said:
             raise
         raise SolveError(f"{said}: {error}") from error
+
+
+@contextmanager
+def splitting_named(watch: SplitWatch | None) -> Iterator[None]:
+    """Say that time splitting is unstable if that shows when a step fails inside of it, in whatever way. Collective.
+
+    What the failure itself advises is no help then.
+    """
+    try:
+        yield
+    except SolveError as error:
+        said = watch.story() if watch is not None else ""
+        if not said:
+            raise
+        what = str(error).split(". ")[0].rstrip(".")
+        raise FinalError(f"{said}. The step failed of it: {what}") from error

@@ -23,6 +23,9 @@ from petfsi.runs.console import open_streams
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+    from petfsi.scene.schema import Scene
+    from petfsi.simulation import Simulation
+
 INTERRUPTED = 130
 #: Seconds that ranks have to fail together before one that failed alone ends the others.
 AGREE_SECONDS = 10.0
@@ -190,21 +193,14 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
         import numpy as np
 
         from petfsi.runs.memory import refuse_too_large
-        from petfsi.runs.plan import describe_plan, is_rehearsed
+        from petfsi.runs.plan import describe_plan
         from petfsi.scene.load import load_scene
 
         petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
         refuse_too_large(loaded)
         with np.errstate(all="ignore"):  # what overflows is told of by those who judge what it gives
-            plan = describe_plan(loaded, petsc, quick)
-            if is_rehearsed(loaded) and not quick:
-                _start_petsc(petsc)
-                from mpi4py import MPI
-
-                from petfsi.runs.ready import made_ready
-
-                made_ready(MPI.COMM_SELF, loaded, petsc)
+            plan = describe_plan(loaded, petsc, None if quick else lambda: _ready(loaded, petsc))
         _say(plan)
         return 0
 
@@ -339,6 +335,16 @@ def new(ctx: click.Context, path: Path, kind: str) -> NoReturn:
         return 0
 
     ctx.exit(_alone(work))
+
+
+def _ready(scene: Scene, petsc: list[str]) -> Simulation:
+    """Return the simulation of a scene, ready for its first step on this process alone."""
+    _start_petsc(petsc)
+    from mpi4py import MPI
+
+    from petfsi.runs.ready import made_ready
+
+    return made_ready(MPI.COMM_SELF, scene, petsc)[0]
 
 
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:

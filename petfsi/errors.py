@@ -17,7 +17,7 @@ class InputError(PetfsiError):
 
 
 class NotStoredError(InputError):
-    """A checkpoint has no such array."""
+    """A checkpoint has no such array, or group."""
 
 
 class SolveError(PetfsiError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 from mpi4py import MPI
@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petfsi import build, causes, petsc
 from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
-from petfsi.errors import FinalError, InputError, NoSolutionError, SolveError
+from petfsi.errors import FinalError, InputError, NoSolutionError, NotStoredError, SolveError
 from petfsi.fields.base import FAR, Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
 from petfsi.guard import EnergyGuard
 from petfsi.scene.schema import Scene
@@ -22,6 +22,7 @@ from petfsi.solving.balance import Balance
 from petfsi.solving.diagonal import DiagonalSolver
 from petfsi.solving.regions import ClosedRegions
 from petfsi.solving.solver import Outcome, Solver
+from petfsi.solving.splitting import SplitWatch
 from petfsi.solving.system import System
 from petfsi.substeps import StableStep
 from petfsi.touch import watch
@@ -65,6 +66,8 @@ class Simulation:
         A split solve spreads a compatible correction over the region: then this is its size.
     guard : EnergyGuard
         Stops a run whose energy grows out of nothing.
+    splitting : SplitWatch or None
+        Stops a run whose splitting scheme is unstable.
     accounts : Accounts
         Momentum, energy and volumes, from ``prepare`` on.
     phases : dict
@@ -98,6 +101,7 @@ class Simulation:
         self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.guard = EnergyGuard(comm, scene)
+        self.splitting = SplitWatch(scene.time.energy_limit >= 0) if self.solver.splits else None
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
@@ -183,9 +187,11 @@ class Simulation:
                 field.predict(t, dt)
             if self.solid and not self.solid.explicit:  # before anything looks for where that is
                 self._check_speed(self.solid, self.solid.predicted() / dt, dt)
-        with causes.touch_named(self.solid, self.watch, t, dt, last):
+        with causes.splitting_named(self.splitting), causes.touch_named(self.solid, self.watch, t, dt, last):
             outcome = self._solve(t, dt)
-        with self.phase("accept"):
+        if self.splitting is not None:
+            self.splitting.judge(self.system)
+        with self.phase("accept"), causes.splitting_named(self.splitting):
             self._accept(t, dt)
             if not isinstance(self.solver, DiagonalSolver):  # else no step makes any
                 petsc.collect_garbage()
@@ -208,6 +214,8 @@ class Simulation:
             part.rewind()
         if self.regions:
             self.regions.rewind()
+        if self.splitting is not None:
+            self.splitting.forget()
         self.solver.reset()
 
     def forget(self) -> None:
@@ -400,14 +408,19 @@ class Simulation:
 
     def _advice(self) -> str:
         """Return what may help a run that blows up."""
-        if self.solver.decoupled:
-            return (
-                "A splitting scheme fails like this where the fluid that moves with the solid outweighs it, at small "
-                "steps most of all: try monolithic.opts. Else more damping, a smaller dt."
-            )
-        if self.stable.limited or self.solver.iterates:
-            return "Try a smaller dt, or more damping."
-        return "Try a smaller dt, -fsi_snes_type newtonls, or more damping."
+        if self.splitting is not None:
+            story = self.splitting.story()
+            other = "Try monolithic.opts, which tells splitting from the physics, a smaller dt, or more damping."
+            return f"{story[0].upper()}{story[1:]}." if story else other
+        if self.scene.time.integrator == "static":
+            return "Try smaller steps of the load, by a smaller dt."
+        helps = ["a smaller dt"]
+        if self.solid is not None:
+            linear = self.solid.is_linear or self.solver.iterates or self.stable.limited
+            helps += [] if linear else ["-fsi_snes_type newtonls"]
+            helps += ["more damping"]
+            helps += ['time.integrator = "bdf2"'] if self.scene.time.integrator == "midpoint" else []
+        return f"Try {' or '.join(filter(None, [', '.join(helps[:-1]), helps[-1]]))}."
 
     def probe_columns(self) -> list[str]:
         """Return the names of the probes' columns in history.csv."""
@@ -472,6 +485,8 @@ class Simulation:
             kept["accounts"], kept["guard"] = held(self.accounts.state()), held(self.guard.state())
         if self.stable.limited:
             kept["stable"] = held(self.stable.state(self.comm))
+        if self.splitting is not None:
+            kept["splitting"] = held(self.splitting.state(self.comm))
         return kept
 
     def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:
@@ -493,6 +508,9 @@ class Simulation:
             self.guard.restore(group("guard"))
         if self.stable.limited:
             self.stable.restore(group("stable"))
+        if self.splitting is not None:
+            with suppress(NotStoredError):  # of a run that was not split so far
+                self.splitting.restore(group("splitting"))
 
     def begin_with(self, names: Collection[str], group: Callable[[str], Reader]) -> None:
         """Take up the state of some fields of a checkpoint: after ``prepare`` all, before it others. Collective.

@@ -1,13 +1,18 @@
 """Time splitting, in PETSc options alone: it grows and decays as linear theory says, and iterated it is monolithic."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mpi4py import MPI
+from step_cases import loaded, prepared, stored
+from test_guard import until_it_stops
+from test_restart import reader
 
 from petfsi.bench import theory
-from petfsi.bench.case import ITERATED, MONOLITHIC, history
+from petfsi.bench.case import ITERATED, MONOLITHIC, SPLIT, history
 from petfsi.bench.splitting import DT, Layer, growth_of_own_matrices, measure_growth
-from petfsi.errors import SolveError
+from petfsi.errors import FinalError, SolveError
 
 COMM = MPI.COMM_SELF
 CELLS = 64
@@ -53,5 +58,91 @@ def test_iterated_splitting_is_the_monolithic_solve(tmp_path, factor):
 def test_iterated_splitting_that_expands_is_an_error(tmp_path):
     layer = Layer.one_mode(2.0 * 1.25, 0.5, (0.0, 0.0), CELLS)
     assert theory.contraction(layer.mass, layer.stiffness, layer.added_mass, DT) == pytest.approx(2.0)
-    with pytest.raises(SolveError, match="DIVERGED_DTOL"):
+    with pytest.raises(SolveError, match="DIVERGED_DTOL.* Iterated splitting .* go on with -options_file monolithic"):
         history(COMM, layer.scene(COMM, tmp_path), ITERATED, 3)
+
+
+# ---- what is said of it -------------------------------------------------------------------------------------
+
+SPLITS = ("-options_file", "split.opts")
+COARSE = "fluid.cells=[8, 16]"
+UNSTABLE = {
+    "a layer": ("jobs/column.toml", COARSE),
+    "a heavy layer": ("jobs/column.toml", COARSE, "solids.layer.density=2e4"),
+    "without accounts": ("jobs/column.toml", COARSE, "output.accounts=false"),
+    "a flap": ("tests/scenes/flap.toml",),
+    "a light bar": ("tests/scenes/bar2d.toml", "solids.bar.density=1.0"),
+    "a ball in a stream": ("tests/scenes/sweep.toml",),
+}
+STABLE = {
+    "a stiff layer": ("jobs/column.toml", COARSE, "solids.layer.density=2e4", "solids.layer.young=1e9"),
+    "a disk": ("jobs/added-mass-disk.toml", "time.end=1", "fluid.cells=[32, 32]"),
+    "a heavy gate": ("jobs/gate.toml", "fluid.cells=[60, 20]", "solids.gate.density=1e5"),
+}
+
+
+def until_it_fails(name, steps, *options):
+    """Return after how many steps a scene fails, and of what."""
+    path, *sets = name
+    with prepared(loaded(Path(__file__).parents[1] / path, *sets), *options, comm=COMM) as sim:
+        for n in range(steps):
+            try:
+                sim.advance()
+            except SolveError as error:
+                return n, error
+    return steps, None
+
+
+@pytest.mark.parametrize("name", UNSTABLE.values(), ids=UNSTABLE)
+def test_an_unstable_splitting_is_named_before_it_turns_anything_inside_out(name):
+    n, error = until_it_fails(name, 12, *SPLITS)
+    assert n < 8 and "ime splitting is unstable here" in str(error) and "inside out" not in str(error)
+    assert "Start again with -options_file monolithic.opts" in str(error)
+    assert until_it_fails(name, n + 3, "-options_file", "monolithic.opts") == (n + 3, None)
+
+
+@pytest.mark.parametrize("name", STABLE.values(), ids=STABLE)
+def test_a_stable_splitting_is_left_alone(name):
+    assert until_it_fails(name, 12, *SPLITS) == (12, None)
+
+
+@pytest.mark.parallel([1, 2])
+def test_what_is_known_of_a_splitting_goes_on_with_a_run():
+    scene = loaded(Path(__file__).parents[1] / "jobs/column.toml", COARSE, "solids.layer.density=2e4")
+    with prepared(scene, *SPLITS) as straight, prepared(scene, *SPLITS) as again:
+        for _ in range(4):
+            straight.advance()
+        arrays = stored(straight)
+        straight.forget()
+        again.restore(straight.step, straight.time, straight.dt, lambda group: reader(arrays[group]))
+        assert again.splitting.rises == straight.splitting.rises > 0
+        assert until_it_stops(straight) == until_it_stops(again) and straight.step == again.step < 8
+
+
+FAILURES = {
+    "no fluid": ("jobs/rollup.toml", ["time.dt=1.0"], ["-fsi_snes_max_it", "2"]),
+    "monolithic": ("jobs/column.toml", [COARSE, "solids.layer.initial.velocity=[0, -400]"], []),
+    "a multiplicative preconditioner": (
+        "jobs/column.toml", [COARSE, "solids.layer.initial.velocity=[0, -400]"],
+        ["-options_file", "split-iterated.opts", "-fsi_ksp_type", "fgmres", "-fsi_ksp_rtol", "1e-8"],
+    ),
+    "split, but inverted by its load": (
+        "jobs/column.toml", [COARSE, "solids.layer.density=1e5", "solids.layer.body_force=[0, -1e12]"],
+        ["-options_file", "split.opts"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "sets", "options"), FAILURES.values(), ids=FAILURES)
+def test_what_fails_of_something_else_does_not_speak_of_splitting(path, sets, options):
+    _, error = until_it_fails((path, "time.retries=0", *sets), 5, *options)
+    assert error is not None and "splitting" not in str(error).lower().replace("tells splitting from", ""), error
+
+
+def test_iterated_splitting_helps_where_stiffness_outweighs_the_fluid(tmp_path):
+    layer = Layer.one_mode(3.0, 4.0, (0.5, 0.0), CELLS)
+    scene = layer.scene(COMM, tmp_path)
+    limited = scene.model_copy(update={"time": scene.time.model_copy(update={"energy_limit": 1.0})})
+    with pytest.raises(FinalError, match=r"split-iterated\.opts holds only where the solid's stiffness"):
+        history(COMM, limited, SPLIT, 40)
+    assert np.isfinite(history(COMM, limited, ITERATED, 10)).all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -381,6 +381,8 @@ class SolidField(Field):
         Whether its tangent never changes, and neither does the stable step.
     acting : tuple of str
         The names in ``forces``, the same in every step and on every rank.
+    warnings : sequence of str
+        What a user should look at before it begins, the same on every rank.
     """
 
     elastic = True
@@ -388,6 +390,7 @@ class SolidField(Field):
     extent: float
     moved: np.ndarray
     acting: tuple[str, ...] = ()
+    warnings: Sequence[str] = ()
     is_linear: bool = False
 
     @property

@@ -61,6 +61,7 @@ class JointSolid(SolidField):
             own = {name: solid for name, solid in scene.solids.items() if kinds[name] == kind}
             self.parts.append(make(comm, scene.model_copy(update={"solids": own})))
         self.explicit = self.diagonal = self.parts[0].explicit
+        self.warnings = [line for part in self.parts for line in part.warnings]
         self.is_linear = all(part.is_linear for part in self.parts)
         self.extent = self._largest_side()
         counts = [part.layout.n_local for part in self.parts]

@@ -56,16 +56,20 @@ def build_bodies(scene: Scene) -> dict[str, Mesh]:
     return meshes
 
 
-def mesh_notes(scene: Scene) -> list[str]:
-    """Return what a user should know of how the files of solids and obstacles are read. Not collective; reads them."""
+def read_files(scene: Scene) -> tuple[dict[str, Mesh], list[str]]:
+    """Return the meshes of solids from files, and what a user should know of how files are read. Not collective.
+
+    Those of obstacles are read for the latter.
+    """
+    meshes: dict[str, Mesh] = {}
     notes: list[str] = []
     for name, solid in scene.solids.items():
         if solid.shape.mesh is not None:
-            build_mesh(solid, scene.dim, f"solids.{name}", scene.directory, notes)
+            meshes[name] = build_mesh(solid, scene.dim, f"solids.{name}", scene.directory, notes)
     for name, obstacle in scene.obstacles.items():
         if obstacle.shape.mesh is not None:
             read_surface(obstacle.shape, scene.dim, f"obstacles.{name}.shape", scene.directory, notes)
-    return notes
+    return meshes, notes
 
 
 def _places(solid: Solid, mesh: Mesh, key: str, tags: Tags) -> list[str]:

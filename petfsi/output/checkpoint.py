@@ -301,7 +301,9 @@ class CheckpointReader:
         would leave the others waiting in the next collective call.
         """
         if name not in self._file:
-            raise InputError(f"checkpoint {self.path} holds no state of '{name}', only of {', '.join(self.groups())}")
+            raise NotStoredError(
+                f"checkpoint {self.path} holds no state of '{name}', only of {', '.join(self.groups())}"
+            )
 
         def read(array: str, start: tuple[int, ...], count: tuple[int, ...]) -> np.ndarray:
             return self._read(f"{name}/{array}", tuple(start), tuple(count))

@@ -31,7 +31,7 @@ MAX_TOLD = 8
 #: Characters of a value that are told.
 _SHOWN = 160
 #: What a checkpoint keeps besides fields, and a new run begins for itself.
-_OWN = ("clock", "accounts", "guard", "stable")
+_OWN = ("clock", "accounts", "guard", "stable", "splitting")
 #: What schemes remember of earlier steps of a solid, and where its stable step was found.
 _PAST = (*{past for name in INTEGRATORS for past in integrator(name).past}, "displacement_measured")
 #: What the state of a fluid does not hang on: numbers of its sides, and what it begins with or is advanced with.

@@ -9,18 +9,24 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise, takewhile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from petfsi import __version__
 from petfsi.errors import InputError
 from petfsi.messages import shown
+from petfsi.notes.note import Note
+from petfsi.notes.notes import find_notes
 from petfsi.runs.memory import PROGRAM_BYTES, as_bytes, available_bytes, needs, solid_bytes
-from petfsi.runs.plan_fluids import fluid_plan, fluid_skipped
+from petfsi.runs.plan_fluids import FluidPlan, fluid_plan, fluid_skipped
 from petfsi.scene.schema import Scene
 from petfsi.scene.solids import Solid
-from petfsi.scene.stepping import Stepping
+from petfsi.scene.stepping import PART, Stepping
 from petfsi.solving import options
+
+if TYPE_CHECKING:
+    from petfsi.simulation import Simulation
 
 #: The options file in force when none is named, and that of large solids alone.
 DEFAULT_OPTIONS, LARGE_OPTIONS = options.DEFAULT, "solid-large.opts"
@@ -37,7 +43,9 @@ PACKAGES = (
 ).split()
 
 
-def describe_plan(scene: Scene, petsc_options: Sequence[str] = (), quick: bool = False) -> str:
+def describe_plan(
+    scene: Scene, petsc_options: Sequence[str] = (), ready: Callable[[], Simulation] | None = None
+) -> str:
     """Return what a run of the scene would do, for people. Not collective; reads the scene's meshes.
 
     Parameters
@@ -46,13 +54,13 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = (), quick: bool =
         A valid scene.
     petsc_options : sequence of str
         PETSc options as on the command line.
-    quick : bool
-        Whether the first step will not be made ready.
+    ready : callable, optional
+        Makes the scene ready for its first step, unless that is too large, and returns the simulation.
 
     Raises
     ------
     InputError
-        With every mistake in its mesh files.
+        With every mistake in its mesh files, or that shows where it is made ready.
     """
     nodes, cells = _solid_sizes(scene)
     if not is_rehearsed(scene) and any(probe.of in scene.solids for probe in scene.probes.values()):
@@ -62,13 +70,28 @@ def describe_plan(scene: Scene, petsc_options: Sequence[str] = (), quick: bool =
         if wrong:
             raise InputError("\n".join(wrong))
     lines = [shown(scene.title, 200) or "untitled", ""]
-    lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, nodes, cells)]
-    lines += [f"{'note:':<13}{note}" for note in mesh_notes(scene)]
-    if quick or not is_rehearsed(scene):
-        why = "not made ready here" if quick else "too large to be made ready here"
+    fluid = fluid_plan(scene)
+    lines += [f"{name + ':':<13}{text}" for name, text in _quantities(scene, fluid, nodes, cells)]
+    meshes, told = read_files(scene)
+    lines += [f"{'note:':<13}{note}" for note in told]
+    if ready is None or not is_rehearsed(scene):
+        why = "too large to be made ready here" if not is_rehearsed(scene) else "not made ready here"
         lines.append(f"{'first step:':<13}{why}: run judges it before it writes anything")
     lines += [f"{'options:':<13}{_options(scene, nodes, petsc_options)}", "", "skipped:"]
-    return "\n".join([*lines, *(f"  {line}" for line in skipped(scene))])
+    lines += [f"  {line}" for line in skipped(scene)]
+    simulation = ready() if ready is not None and is_rehearsed(scene) else None
+    notes = (
+        find_notes(scene, meshes, _first_step(scene, fluid.step)) if simulation is None else told_of(simulation, meshes)
+    )
+    return "\n".join([*lines, *["", "notes:"][: 2 * bool(notes)], *(f"  {note}" for note in notes)])
+
+
+def _first_step(scene: Scene, limit: float | None) -> float | None:
+    """Return the length of the first step, s, where it is known; ``limit`` is that of particles."""
+    stepping = Stepping(scene.time)
+    if stepping.auto:
+        return None if limit is None else PART * limit
+    return stepping.length(0.0)
 
 
 def default_options(scene: Scene) -> str:
@@ -89,14 +112,27 @@ def _default_options(scene: Scene, nodes: dict[str, int]) -> str:
     return LARGE_OPTIONS if large else DEFAULT_OPTIONS
 
 
-def mesh_notes(scene: Scene) -> list[str]:
-    """Return what a user should know of how mesh files are read. Not collective; reads them again."""
+def read_files(scene: Scene) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], list[str]]:
+    """Return the meshes of solids from files, and what a user should know of how files are read. Not collective."""
     shapes = [solid.shape for solid in scene.solids.values()] + [one.shape for one in scene.obstacles.values()]
     if all(shape.mesh is None for shape in shapes):
-        return []
+        return {}, []
     from petfsi.geometry import bodies
 
-    return bodies.mesh_notes(scene)
+    return bodies.read_files(scene)
+
+
+def told_of(simulation: Simulation, meshes: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[Note]:
+    """Return what a user should know of a scene that is ready for its first step. Not collective.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    meshes : mapping of str to (points, cells)
+        Of the solids from mesh files.
+    """
+    own = [] if simulation.solid is None else [Note(text, warns=True) for text in simulation.solid.warnings]
+    return own + find_notes(simulation.scene, meshes, simulation.dt, simulation.solver.splits)
 
 
 def skipped(scene: Scene) -> list[str]:
@@ -130,8 +166,7 @@ def is_rehearsed(scene: Scene) -> bool:
     return sum(need for *_, need in needs(scene)) <= REHEARSED and len(scene.solids) <= MANY
 
 
-def _quantities(scene: Scene, nodes: dict[str, int], cells: dict[str, int]) -> list[tuple[str, str]]:
-    fluid = fluid_plan(scene)
+def _quantities(scene: Scene, fluid: FluidPlan, nodes: dict[str, int], cells: dict[str, int]) -> list[tuple[str, str]]:
     rows, unknowns = list(fluid.rows), fluid.unknowns
     if nodes:
         n = sum(count * (scene.dim if scene.solids[name].shape.beam is None else 3) for name, count in nodes.items())

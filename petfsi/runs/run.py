@@ -21,7 +21,7 @@ from petfsi.ranks import on_root
 from petfsi.runs.console import Console
 from petfsi.runs.legs import describe_changes, find_changes, judge_changes
 from petfsi.runs.origin import Origin
-from petfsi.runs.plan import MAX_COUNTED, mesh_notes
+from petfsi.runs.plan import MAX_COUNTED, read_files, told_of
 from petfsi.runs.ready import made_ready
 from petfsi.runs.running import DONE, Run
 from petfsi.runs.stop import Stop
@@ -176,8 +176,19 @@ def _greet(console: Console, simulation: Simulation, options: Options, unread: l
     for line in beginning(simulation, options, files):
         console.note(line)
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
-    told.append(on_root(simulation.comm, lambda: mesh_notes(simulation.scene)) if simulation.step == 0 else [])
+    warned: list[str] = []
+    if simulation.step == 0:
+        read, warned = on_root(simulation.comm, lambda: _begins(simulation))
+        told.append(read)
     for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:
         console.note(note)
+    for line in warned:
+        console.warn(line)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")
+
+
+def _begins(simulation: Simulation) -> tuple[list[str], list[str]]:
+    """Return what to say of the mesh files of a run that begins, and what to warn of. Not collective."""
+    meshes, files = read_files(simulation.scene)
+    return files, [note.text for note in told_of(simulation, meshes) if note.warns]

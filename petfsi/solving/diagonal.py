@@ -17,7 +17,7 @@ class DiagonalSolver:
     It has the face of ``solve.Solver`` and reads no option.
     """
 
-    decoupled = iterates = False
+    decoupled = splits = iterates = False
 
     def __init__(self, system: System) -> None:
         self.system = system

@@ -79,7 +79,10 @@ class Modes:
         try:
             self._capacity = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-13, hermitian=True)
         except np.linalg.LinAlgError:
-            raise SolveError("the motions of light bodies push on the fluid beyond what numbers can hold") from None
+            raise SolveError(
+                "the motions of light bodies push on the fluid beyond what numbers can hold; "
+                "-fsi_fieldsplit_pressure_modes_degree -1 leaves them out"
+            ) from None
         self._capacity /= np.outer(size, size)
         for vec in (motion, resisted, pushed, answer):
             vec.destroy()

@@ -138,6 +138,8 @@ class Solver:
     decoupled : bool
         Whether each block is inverted by itself (a fieldsplit other than Schur's), so that a region closed by
         an elastic wall is singular to the pressure block though not to the system.
+    splits : bool
+        Whether that is done so often and no more: a splitting scheme in time, which leaves a residual.
     iterates : bool
         Whether each step is solved by Newton's method.
     """
@@ -164,6 +166,7 @@ class Solver:
         self.decoupled = not single and splits and split != "schur"
         # a fixed number of iterations from the last step's solution is a splitting scheme: nothing converges
         self.fixed_iterations = options.getString("ksp_convergence_test", "default") == "skip"
+        self.splits = self.decoupled and self.fixed_iterations
         if self.fixed_iterations and self.iterates:
             raise InputError(
                 f"option -{PREFIX}snes_type newtonls: wants linear systems solved, and -{self.prefix}"
@@ -440,9 +443,20 @@ class Solver:
         raise SolveError(
             f"solver '{culprit.getOptionsPrefix()}' stopped with {petsc.reason_name(culprit)} after "
             f"{culprit.getIterationNumber()} iterations: |b - Kx| = {norms['']:.1e}, wanted {wanted:.1e} "
-            f"(|b| = {norms['rhs']:.1e}); by field: {by_field}.{doubt} To tell the solver from the physics, run this "
-            f"step with -options_file monolithic-direct.opts."
+            f"(|b| = {norms['rhs']:.1e}); by field: {by_field}.{doubt} {self._advice(culprit)}"
         )
+
+    def _advice(self, culprit: PETSc.KSP) -> str:
+        """Return what helps where a solver inside, or the whole one, has not converged."""
+        whole = culprit.getOptionsPrefix() == self.prefix
+        if whole and self.decoupled and culprit.getType() == PETSc.KSP.Type.RICHARDSON:
+            return (
+                "Iterated splitting diverges where the fluid that moves with the solid outweighs it (added mass), its "
+                "stiffness and damping in a step included: go on with -options_file monolithic.opts."
+            )
+        if whole and culprit.getPC().getType() in (PETSc.PC.Type.LU, PETSc.PC.Type.CHOLESKY):
+            return "Smaller steps may help; look at densities, stiffness and supports."
+        return "To tell the solver from the physics, run this step with -options_file monolithic-direct.opts."
 
     def check_options(self) -> list[str]:
         """Set up, refuse petfsi options that nothing has read, and return the other unread ones, to warn of.

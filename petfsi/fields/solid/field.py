@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 from petfsi.errors import InputError
 from petfsi.fields.base import FAR, Forces, Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.solid.conflicts import conflicts
 from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
@@ -104,6 +105,7 @@ class NodalSolid(SolidField):
 
         self._tags = on_root(comm, lambda: _tags(scene, solids, mesh))
         self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
+        self.warnings = conflicts(self._supports.overlaps, scene.time.end)
         self._damping = np.array([[solid.damping.mass, solid.damping.stiffness] for solid in solids.values()])
         self._lumped = self._lump() if self.explicit else None
         self._set_pattern()

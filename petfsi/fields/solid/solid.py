@@ -212,9 +212,10 @@ class SimplexSolid(NodalSolid):
         if not np.min(least) <= 0:
             return ""
         name = self.names[int(np.argmin(least))]
+        damping = ", more damping," if self._has_inertia else ""
         return (
             f"solids.{name} has turned an element inside out: det F = {np.min(least):.1e}. What comes of that is "
-            f'no motion of its material; smaller steps, more damping, or material = "stable-neohookean"'
+            f'no motion of its material; smaller steps{damping} or material = "stable-neohookean" may help'
         )
 
     def _smallest_ratios(self, displacement: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from petfsi.fields.solid.conflicts import Overlap, Rule
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.geometry.places import Tags, located
 from petfsi.integrators.base import Integrator, Motion, Stage
@@ -25,7 +26,7 @@ AGREE = 1e-5
 class Supports:
     """The prescribed unknowns of all bodies, the same on every rank.
 
-    Where supports overlap, the later one in the scene holds.
+    Where supports overlap, the later one in the scene holds; see ``conflicts``.
 
     Parameters
     ----------
@@ -48,6 +49,8 @@ class Supports:
         Global numbers, ascending.
     placed : ndarray of int
         Which of ``unknowns`` have a prescribed displacement; the others have a velocity.
+    overlaps : list of Overlap
+        Where two supports prescribe the same unknowns.
     """
 
     def __init__(
@@ -56,29 +59,36 @@ class Supports:
     ) -> None:  # fmt: skip
         width = len(components)
         rule = np.full((len(points), width), -1, dtype=np.int32)
-        rules: list[tuple[str, Expression]] = []
+        rules: list[Rule] = []
+        self.overlaps: list[Overlap] = []
         for body, (name, solid) in enumerate(solids.items()):
             nodes = np.flatnonzero(node_body == body)
             for n, support in enumerate(solid.supports):
                 key = f"solids.{name}.supports.{n}"
                 held = nodes[located(support.where, points[nodes], key, tags.get(name, {}))]
                 for letter in dict.fromkeys(support.fix):
-                    rule[held, components.index(letter)] = len(rules)
                     quantity = "displacement" if letter in support.displacement else "velocity"
                     source = getattr(support, quantity).get(letter, 0.0)
-                    rules.append((quantity, Expression(source, key=f"{key}.{quantity}.{letter}")))
+                    own = Rule(key, letter, quantity, Expression(source, key=f"{key}.{quantity}.{letter}"), support)
+                    before = rule[held, components.index(letter)]
+                    self.overlaps += [
+                        Overlap(rules[index], own, points[held[before == index]])
+                        for index in np.unique(before[before >= 0])
+                    ]
+                    rule[held, components.index(letter)] = len(rules)
+                    rules.append(own)
         node, direction = np.nonzero(rule >= 0)
         unknowns = width * number[node].astype(np.int64) + direction
         order = np.argsort(unknowns)
         self.unknowns = unknowns[order]
         self._assign(rules, rule[node, direction][order], points[node[order]])
 
-    def _assign(self, rules: list[tuple[str, Expression]], chosen: np.ndarray, where: np.ndarray) -> None:
+    def _assign(self, rules: list[Rule], chosen: np.ndarray, where: np.ndarray) -> None:
         """Note which expression gives which of the unknowns, and at what position."""
         self._values = np.zeros(len(chosen))
         self._reach = float(np.abs(where).max(initial=0.0))
         self._moving, self._placing = [], []
-        for index, (quantity, expression) in enumerate(rules):
+        for index, (_, _, quantity, expression, _) in enumerate(rules):
             entries = np.flatnonzero(chosen == index)
             part = expression, entries, {"z": 0.0, **dict(zip("xyz", where[entries].T, strict=False))}
             if len(entries) and quantity == "displacement":

@@ -1,0 +1,119 @@
+"""Notes on solids: what holds them, whether their elements lock, and how their swings compare with the step."""
+
+from __future__ import annotations
+
+import math
+
+from petfsi.notes.bending import bending_period, carried, excess, wave_time
+from petfsi.notes.forms import SLENDER, Form
+from petfsi.notes.note import Note, Notes, View
+from petfsi.scene.solids import Solid
+
+#: Elements that bend too stiffly by more than this part are warned of; the advice gets below the second part.
+STIFF, FINE = 0.5, 0.15
+#: Beyond this it is not said how much.
+MOST_SAID = 30.0
+#: Elements so many times as long as thick lock even if they are quadratic.
+LONG = 3.0
+#: A period wants so many steps; with fewer than the second it is blurred, as far as an estimate can tell, and with
+#: fewer than the third it is not seen at all: the solid follows its loads.
+RESOLVED, BLURRED, SEEN = 10.0, 7.0, 2.0
+#: What an integrator does with waves that are too fast for its steps.
+WAVES = {
+    "bdf2": "damped by bdf2",
+    "newmark": "damped by newmark",
+    "midpoint": "which midpoint does not damp",
+    "symplectic-euler": "which limits the step",
+}
+
+
+def loose(view: View) -> Notes:
+    """Tell of solids that nothing holds: floats and things that fly are meant to be, others fall."""
+    scene = view.scene
+    falls = any(value != 0 for value in scene.gravity or [])
+    for name, solid in scene.solids.items():
+        if solid.supports or scene.time.integrator == "static":
+            continue
+        if scene.fluid is not None:
+            ratio = solid.density / scene.fluid.density
+            yield Note(f"solids.{name}: nothing holds it in the fluid, of which it has {ratio:.3g} times the density")
+        elif falls or solid.loads or solid.body_force:
+            what = "gravity" if falls else "its load"
+            yield Note(f"solids.{name}: it has no supports and no fluid around it; {what} carries it away", warns=True)
+        else:
+            yield Note(f"solids.{name}: nothing holds it")
+
+
+def locking(view: View) -> Notes:
+    """Warn of linear elements that are too few across what bends, or too incompressible."""
+    for name, form in view.forms.items():
+        solid = view.scene.solids[name]
+        if solid.shape.beam is not None or solid.elements != "linear" or not _bends(view, name):
+            continue
+        part = excess(solid, form, solid.volumetric)
+        if part <= STIFF:
+            continue
+        times = f"about {1 + part:.2g}" if part < MOST_SAID else f"more than {MOST_SAID:g}"
+        yield Note(
+            f"solids.{name}: linear elements, {form.across:.2g} across it, poisson = {solid.poisson:g}: it bends "
+            f"{times} times too stiffly (locking); {_remedy(solid, form)}",
+            warns=True,
+        )
+
+
+def _remedy(solid: Solid, form: Form) -> str:
+    """Return what makes a solid bend as it should."""
+    if form.spacing[-1] > LONG * form.spacing[0]:
+        beam = ", or give it as a beam" if len(form.axes) == 2 else ""
+        return f'set elements = "quadratic", with more of them along it{beam}'
+    full, reduced = (
+        math.ceil(form.across * math.sqrt(excess(solid, form, kind) / FINE)) for kind in (solid.volumetric, "reduced")
+    )
+    more = f'volumetric = "reduced" and {reduced}' if reduced < full else f"{full}"
+    return f'set elements = "quadratic", or take {more} across it'
+
+
+def _bends(view: View, name: str) -> bool:
+    """Return whether a solid can bend: a hollow one in its walls."""
+    form = view.forms[name]
+    hollow = view.scene.solids[name].shape.cavity is not None
+    return view.spans[name] is not None or (hollow and form.lengths[-1] >= SLENDER * form.thickness)
+
+
+def swings(view: View) -> Notes:
+    """Hold periods of bending, and waves through elements, against the step."""
+    scene, dt = view.scene, view.dt
+    if scene.time.integrator == "static":
+        return
+    for name, form in view.forms.items():
+        solid = scene.solids[name]
+        wave, span = wave_time(solid, form), view.spans[name]
+        waves = f"pressure waves cross an element in {wave:.2g} s"
+        if dt is not None:
+            waves += f" = {_steps(wave / dt)}" + (f", {WAVES[scene.time.integrator]}" if wave < dt else "")
+        if span is None:
+            yield Note(f"solids.{name}: {waves}")
+            continue
+        period = bending_period(solid, form, span)
+        wet = period
+        if scene.fluid is not None:
+            wet *= math.sqrt(1 + carried(form, solid.density, scene.fluid.density))
+        said = f"solids.{name}: its slowest bending takes about {period:.2g} s"
+        said += f" = {_steps(period / dt)}" if dt is not None else ""
+        if wet > 1.2 * period:
+            said += f" ({wet:.2g} s with the fluid it moves)"
+        yield Note(f"{said}; {waves}")
+        if dt is not None and SEEN <= wet / dt < BLURRED:
+            yield Note(
+                f"solids.{name}: its slowest bending takes about {_steps(wet / dt)}, too few to be followed; time.dt = "
+                f"{0.95 * wet / RESOLVED:.2g} resolves it",
+                warns=True,
+            )
+
+
+def _steps(number: float) -> str:
+    """Return a number of steps, or which part of one, to two digits."""
+    size = max(number, 1 / number)
+    digits = 1 - math.floor(math.log10(size))
+    text = f"{round(size, digits):,.{max(digits, 0)}f}" if size < 1e15 else f"{size:.1e}"
+    return f"{text} steps" if number >= 1 else f"1/{text} step"
