@@ -85,6 +85,8 @@ class Integrator(ABC):
         Whether k = 0, and the mass lumped, so that A is diagonal and a step beyond the stable one grows.
     inertia : bool
         Whether anything resists being accelerated.
+    damps : bool
+        Whether it damps what is too fast for the step.
     swings : bool
         Whether a step's end depends on the last w as on the next, so that w may swing about what leads there.
     """
@@ -93,6 +95,7 @@ class Integrator(ABC):
     past: ClassVar[tuple[str, ...]] = ()
     explicit: ClassVar[bool] = False
     inertia: ClassVar[bool] = True
+    damps: ClassVar[bool] = True
     swings: ClassVar[bool] = False
 
     @abstractmethod

@@ -24,6 +24,7 @@ class Midpoint(Integrator):
     """
 
     order: ClassVar[int] = 2
+    damps: ClassVar[bool] = False
     past: ClassVar[tuple[str, ...]] = ("velocity_middle", "velocity_ahead")
 
     def factor(self, h: float, past_dt: float) -> float:

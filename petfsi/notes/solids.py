@@ -7,6 +7,7 @@ import math
 from petfsi.notes.bending import bending_period, carried, excess, wave_time
 from petfsi.notes.forms import SLENDER, Form
 from petfsi.notes.note import Note, Notes, View
+from petfsi.scene.schema import Time
 from petfsi.scene.solids import Solid
 
 #: Elements that bend too stiffly by more than this part are warned of; the advice gets below the second part.
@@ -18,13 +19,6 @@ LONG = 3.0
 #: A period wants so many steps; with fewer than the second it is blurred, as far as an estimate can tell, and with
 #: fewer than the third it is not seen at all: the solid follows its loads.
 RESOLVED, BLURRED, SEEN = 10.0, 7.0, 2.0
-#: What an integrator does with waves that are too fast for its steps.
-WAVES = {
-    "bdf2": "damped by bdf2",
-    "newmark": "damped by newmark",
-    "midpoint": "which midpoint does not damp",
-    "symplectic-euler": "which limits the step",
-}
 
 
 def loose(view: View) -> Notes:
@@ -32,7 +26,7 @@ def loose(view: View) -> Notes:
     scene = view.scene
     falls = any(value != 0 for value in scene.gravity or [])
     for name, solid in scene.solids.items():
-        if solid.supports or scene.time.integrator == "static":
+        if solid.supports or not scene.time.scheme.inertia:
             continue
         if scene.fluid is not None:
             ratio = solid.density / scene.fluid.density
@@ -83,14 +77,14 @@ def _bends(view: View, name: str) -> bool:
 def swings(view: View) -> Notes:
     """Hold periods of bending, and waves through elements, against the step."""
     scene, dt = view.scene, view.dt
-    if scene.time.integrator == "static":
+    if not scene.time.scheme.inertia:
         return
     for name, form in view.forms.items():
         solid = scene.solids[name]
         wave, span = wave_time(solid, form), view.spans[name]
         waves = f"pressure waves cross an element in {wave:.2g} s"
         if dt is not None:
-            waves += f" = {_steps(wave / dt)}" + (f", {WAVES[scene.time.integrator]}" if wave < dt else "")
+            waves += f" = {_steps(wave / dt)}" + (f", {_beyond(scene.time)}" if wave < dt else "")
         if span is None:
             yield Note(f"solids.{name}: {waves}")
             continue
@@ -117,3 +111,10 @@ def _steps(number: float) -> str:
     digits = 1 - math.floor(math.log10(size))
     text = f"{round(size, digits):,.{max(digits, 0)}f}" if size < 1e15 else f"{size:.1e}"
     return f"{text} steps" if number >= 1 else f"1/{text} step"
+
+
+def _beyond(time: Time) -> str:
+    """Return what becomes of waves that are too fast for the steps."""
+    if time.scheme.explicit:
+        return "which limits the step"
+    return f"damped by {time.integrator}" if time.scheme.damps else f"which {time.integrator} does not damp"
