@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from mpi4py import MPI
-from output_cases import grid, output
+from output_cases import SCENE, grid, output
 from PIL import Image, ImageSequence
 from processes import environment
 from test_point_clouds import groups
@@ -174,7 +174,7 @@ def test_a_run_without_fields_has_no_film(tmp_path, capsys):
 
 def test_a_new_run_takes_the_place_of_an_old_one_and_its_film(tmp_path):
     path = tmp_path / "run"
-    RunDirectory.create(path, "first", "", overwrite=False, comm=MPI.COMM_SELF)
+    RunDirectory.create(path, SCENE, "", overwrite=False, comm=MPI.COMM_SELF)
     write(path, "solid", [0])
     (path / "particles.xdmf").write_text("the first run's")
     film_run(path)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from mpi4py import MPI
-from output_cases import centres, grid, grid_fields, output, run_on, shared_directory, solid_fields
+from output_cases import SCENE, centres, grid, grid_fields, output, run_on, shared_directory, solid_fields
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output.fields import FieldWriter
@@ -313,7 +313,7 @@ def test_a_run_is_made_once_and_found_again(tmp_path):
 @pytest.mark.parallel([1, 3])
 def test_overwrite_removes_what_petfsi_wrote_and_nothing_else(tmp_path):
     path = shared_directory(tmp_path, comm) / "run"
-    run = RunDirectory.create(path, "first", "", overwrite=False, comm=comm)
+    run = RunDirectory.create(path, SCENE, "", overwrite=False, comm=comm)
     write_fields(path, 2, [0, 5])
     History(run.history, COLUMNS, comm).append(row(1))
     write_summary(run.summary, Summary("done", 1, 0.1), comm)

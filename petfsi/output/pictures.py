@@ -23,9 +23,10 @@ from petfsi.geometry.surfaces import boundary_facets
 from petfsi.output import files
 from petfsi.output.fields import field_files
 from petfsi.output.history import read_history
+from petfsi.output.history_figure import history_figure
 from petfsi.output.slices import cut_tetrahedra
 from petfsi.output.stage import SHOWN, Frame, Stage, look_through, quantity, read_frame
-from petfsi.output.surroundings import GREY, LINE, draw_obstacles, draw_sides
+from petfsi.output.surroundings import GREY, LINE, draw_obstacles, draw_sides, scene_of
 
 #: The colours of bodies, in turn.
 BODIES = ("#f3dcbd", "#c7dff0", "#d5ecc9", "#f2cdd6", "#e0d3ee")
@@ -64,7 +65,7 @@ def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list
     pictures = own_pictures(directory)
     drawn = []
     if history.exists():
-        drawn.append(_save(_history_figure(read_history(history)), pictures / "history.png"))
+        drawn.append(_save(history_figure(read_history(history), scene_of(directory)), pictures / "history.png"))
     if frames:
         try:
             stage = look_through(directory, frames, colour)
@@ -93,37 +94,6 @@ def _save(figure: Figure, path: Path) -> Path:
     with open(files.new_file(path), "wb") as file:
         figure.savefig(file, dpi=_DPI, format="png")
     return path
-
-
-# ---- history ------------------------------------------------------------------------------------------------
-
-
-def _history_figure(table: dict[str, np.ndarray]) -> Figure:
-    """Return every column over time: the components of a probe share a panel."""
-    panels: dict[str, list[str]] = {}
-    for name in table:
-        if name not in ("step", "time", "dt", "iterations", "residual"):
-            panels.setdefault(name.rpartition(".")[0] or name, []).append(name)
-    panels |= {name: [name] for name in ("iterations", "residual") if name in table}
-    figure = Figure(figsize=(8.0, 1.9 * len(panels) + 0.6), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)) if panels else []
-    for ax, (title, columns) in zip(axes, panels.items(), strict=True):
-        for column in columns:
-            values = table[column]
-            label = column.rpartition(".")[2] if len(columns) > 1 else None
-            ax.plot(
-                table["time"], values, lw=1.3, label=label, drawstyle="steps-post" if title == "iterations" else None
-            )
-        if title == "residual" and np.any(table["residual"] > 0):
-            ax.set_yscale("log")
-        if len(columns) > 1:
-            ax.legend(loc="best", ncols=len(columns), frameon=False, fontsize="small")
-        ax.set_ylabel(title)
-        ax.grid(alpha=0.3)
-        ax.margins(x=0)
-    if panels:
-        axes[-1].set_xlabel("time, s")
-    return figure
 
 
 # ---- drawing ------------------------------------------------------------------------------------------------

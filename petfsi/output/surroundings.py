@@ -15,6 +15,7 @@ from matplotlib.path import Path as Outline
 from petfsi.geometry.obstacles import obstacle_surface
 from petfsi.output.slices import section
 from petfsi.scene.load import load_scene
+from petfsi.scene.schema import Scene
 
 #: The sides of each axis, lower and upper.
 _SIDES = (("left", "right"), ("bottom", "top"), ("back", "front"))
@@ -55,10 +56,16 @@ class Surroundings:
     obstacles: tuple[Rigid, ...]
 
 
+def scene_of(directory: Path) -> Scene | None:
+    """Return a run's scene; None of a directory without one."""
+    path = Path(directory) / "scene.toml"
+    return load_scene(path) if path.exists() else None
+
+
 def read_surroundings(directory: Path) -> Surroundings | None:
     """Return the surroundings in a run's scene; None of a directory without one."""
-    path = Path(directory) / "scene.toml"
-    return surroundings_of(load_scene(path)) if path.exists() else None
+    scene = scene_of(directory)
+    return None if scene is None else surroundings_of(scene)
 
 
 def surroundings_of(scene: Any) -> Surroundings:
