@@ -209,13 +209,16 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
 
 @cli.command()
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--every", type=click.IntRange(min=1), default=1, help="Draw every K-th output only.", metavar="K")
 @click.option(
-    "--color",
-    "colour",
-    type=click.Choice(["smoke", "speed", "pressure", "displacement"]),
-    help="What is coloured; by default the first of these that the run has and that varies.",
+    "--quantity",
+    metavar="NAME",
+    help="What is coloured: smoke, speed, pressure, vorticity or displacement, as far as the run has it; by default "
+    "the first of smoke, speed and pressure that varies, or the displacement where there is no fluid.",
 )
+@click.option("--from", "begin", type=Seconds(), metavar="T", help="Draw outputs from this time on, s.")
+@click.option("--to", "end", type=Seconds(), metavar="T", help="Draw outputs up to this time, s.")
+@click.option("--every", type=click.IntRange(min=1), default=1, help="Draw every K-th of these only.", metavar="K")
+@click.option("--format", "kind", type=click.Choice(["png", "pdf", "svg"]), help="Of pictures; png by default.")
 @click.option(
     "--film",
     is_flag=False,
@@ -226,25 +229,38 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
 @click.option("--fps", type=float, help="Frames per second of the film; by default real time, within 5 and 30.")
 @click.pass_context
 def plot(
-    ctx: click.Context, directory: Path, every: int, colour: str | None, film: str | None, fps: float | None
+    ctx: click.Context,
+    directory: Path,
+    quantity: str | None,
+    begin: float | None,
+    end: float | None,
+    every: int,
+    kind: str | None,
+    film: str | None,
+    fps: float | None,
 ) -> NoReturn:
     """Draw pictures of the run in DIR, or a film of it."""
     if fps is not None and film is None:
         raise click.UsageError("--fps is the speed of a film: give --film, too", ctx)
+    if kind is not None and film is not None:
+        raise click.UsageError("--format is that of pictures: a film is what the ending of --film FILE says", ctx)
 
     def work() -> int:
         _start_petsc()  # before the fields' code does, with a signal handler
+        from petfsi.output.frames import Wanted
+
+        wanted = Wanted(every, begin, end, quantity)
         if film is not None:
             if _launched_rank() > 0:
                 return 0  # a film is one file
             from petfsi.output.film import film_run
 
-            file, frames, speed = film_run(directory, Path(film) if film else None, every, fps, colour)
+            file, frames, speed = film_run(directory, Path(film) if film else None, wanted, fps)
             _say(f"{file}: {frames} frame{'s' if frames != 1 else ''}, {speed:.3g} per second")
             return 0
         from petfsi.output.pictures import plot_run
 
-        for picture in plot_run(directory, every, colour):
+        for picture in plot_run(directory, wanted, kind or "png"):
             _say(str(picture))
         return 0
 

@@ -13,6 +13,13 @@ from processes import environment, launcher
 from petfsi.fields.base import Slab
 from petfsi.output.xdmf import GridInfo
 
+#: A scene that pictures may be drawn of.
+SCENE = """
+dim = 2
+time = { end = 1, dt = 0.1 }
+fluid = { density = 1, origin = [0.5, -1.0], size = [1.5, 2.5], cells = [6, 5] }
+"""
+
 
 def shared_directory(tmp_path: Path, comm: MPI.Comm) -> Path:
     """Return rank 0's temporary directory on all ranks."""

@@ -105,10 +105,13 @@ def test_resume_passes_everything_on(calls):
 
 def test_plot_names_its_pictures(monkeypatch, capsys):
     module = types.ModuleType("petfsi.output.pictures")
-    module.plot_run = lambda directory, every, colour: [directory / f"{every}.png"]
+    module.plot_run = lambda directory, wanted, kind: [directory / f"{wanted}.{kind}"]
     monkeypatch.setitem(sys.modules, "petfsi.output.pictures", module)
     assert cli.main(["plot", "runs/a", "--every", "5"]) == 0
-    assert capsys.readouterr().out == "runs/a/5.png\n"
+    assert capsys.readouterr().out == "runs/a/Wanted(every=5, begin=None, end=None, quantity=None).png\n"
+    words = ["--quantity", "speed", "--from", "0", "--to", "2.5", "--format", "svg"]
+    assert cli.main(["plot", "runs/a", *words]) == 0
+    assert capsys.readouterr().out == "runs/a/Wanted(every=1, begin=0.0, end=2.5, quantity='speed').svg\n"
 
 
 # ---- what is refused ----------------------------------------------------------------------------------------
@@ -132,6 +135,9 @@ def test_plot_names_its_pictures(monkeypatch, capsys):
         (["resume"], "Missing argument 'DIR'"),
         (["resume", "runs/a", "--overwrite"], "No such option"),
         (["plot", "runs/a", "--every", "0"], "Invalid value for '--every'"),
+        (["plot", "runs/a", "--from", "nan"], "Invalid value for '--from': 'nan' is no number"),
+        (["plot", "runs/a", "--format", "gif"], "Invalid value for '--format'"),
+        (["plot", "runs/a", "--film", "--format", "pdf"], "--format is that of pictures"),
         (["plot", "runs/a", "-fsi_pc_type"], "No such option"),
         (["run", "SCENE", "--set", "time.dt"], "must be key=value"),
         (["run", "SCENE", "--set", "time.dtt=1"], "did you mean 'dt' (s)?"),

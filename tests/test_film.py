@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from mpi4py import MPI
-from output_cases import grid, output
+from output_cases import SCENE, grid, output
 from PIL import Image, ImageSequence
 from processes import environment
 from test_point_clouds import groups
@@ -16,8 +16,9 @@ from test_point_clouds import groups
 from petfsi import cli
 from petfsi.errors import InputError
 from petfsi.output import film
-from petfsi.output.fields import FieldWriter
+from petfsi.output.fields import FieldWriter, field_files
 from petfsi.output.film import film_run
+from petfsi.output.frames import Wanted
 from petfsi.output.rundir import RunDirectory
 
 KINDS = ["grid", "solid", "particles"]
@@ -54,7 +55,7 @@ def test_a_film_shows_every_output_time(tmp_path, capsys, kind):
     assert [path.name for path in file.parent.iterdir()] == ["film.gif"]
     shown, durations = frames(file)
     assert len(shown) == 3 and durations == [200, 200, 200]
-    paths = film.field_files(tmp_path)
+    paths = field_files(tmp_path)
     (last,) = film._pictures(tmp_path, film.look_through(tmp_path, paths), paths[-1:])
     off = [np.mean(np.abs(picture - last)) for picture in shown]
     assert off[2] < 1.5 and off[2] < 0.3 * min(off[:2]), (
@@ -64,7 +65,7 @@ def test_a_film_shows_every_output_time(tmp_path, capsys, kind):
 
 def test_colours_mean_the_same_in_all_frames(tmp_path):
     write(tmp_path, "particles")
-    file, n, _ = film_run(tmp_path, tmp_path / "p.gif", colour="pressure")
+    file, n, _ = film_run(tmp_path, tmp_path / "p.gif", Wanted(quantity="pressure"))
     shown, _ = frames(file)
     assert n == 3
     bar = np.s_[:, int(0.88 * shown[0].shape[1]) :]
@@ -75,14 +76,14 @@ def test_colours_mean_the_same_in_all_frames(tmp_path):
 def test_the_speed_is_real_time_within_bounds_or_as_asked(tmp_path):
     (tmp_path / "fast").mkdir()
     write(tmp_path, "solid", range(11))
-    paths = film.field_files(tmp_path)
+    paths = field_files(tmp_path)
     assert film._real_time(paths) == pytest.approx(10.0)
     assert film._real_time(paths[::5]) == film._real_time(paths[:1]) == 5.0
-    assert film_run(tmp_path, tmp_path / "a.gif", every=4, fps=30.0)[1:] == (3, 30.0)
+    assert film_run(tmp_path, tmp_path / "a.gif", Wanted(every=4), fps=30.0)[1:] == (3, 30.0)
     shown, durations = frames(tmp_path / "a.gif")
     assert durations == [30, 40, 30], "in hundredths of a second, the right sum"
     write(tmp_path / "fast", "solid", range(3), dt=0.01)
-    assert film._real_time(film.field_files(tmp_path / "fast")) == 30.0
+    assert film._real_time(field_files(tmp_path / "fast")) == 30.0
 
 
 def test_a_frame_may_be_as_the_one_before():
@@ -148,8 +149,8 @@ def test_ffmpeg_may_fail_early_and_says_why(tmp_path, monkeypatch):
         (["--film", "--fps", "60"], "--fps 60: must be"),
         (["--film", "--fps", "fast"], "Invalid value for '--fps'"),
         (["--fps", "3"], "--fps is the speed of a film: give --film, too"),
-        (["--film", "--color", "smoke"], "--color smoke: the fields in"),
-        (["--color", "taste"], "Invalid value for '--color'"),
+        (["--film", "--quantity", "smoke"], "--quantity smoke: the fields in"),
+        (["--film", "--from", "2"], "--from 2: no output time of"),
     ],
 )
 def test_a_film_that_cannot_be_is_refused(tmp_path, monkeypatch, capsys, words, said):
@@ -174,7 +175,7 @@ def test_a_run_without_fields_has_no_film(tmp_path, capsys):
 
 def test_a_new_run_takes_the_place_of_an_old_one_and_its_film(tmp_path):
     path = tmp_path / "run"
-    RunDirectory.create(path, "first", "", overwrite=False, comm=MPI.COMM_SELF)
+    RunDirectory.create(path, SCENE, "", overwrite=False, comm=MPI.COMM_SELF)
     write(path, "solid", [0])
     (path / "particles.xdmf").write_text("the first run's")
     film_run(path)

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from mpi4py import MPI
-from output_cases import centres, grid, grid_fields, output, run_on, shared_directory, solid_fields
+from output_cases import SCENE, centres, grid, grid_fields, output, run_on, shared_directory, solid_fields
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output.fields import FieldWriter
+from petfsi.output.frames import Wanted
 from petfsi.output.history import History, column_names, read_history
 from petfsi.output.manifest import Record
-from petfsi.output.pictures import plot_run
+from petfsi.output.pictures import FORMATS, plot_run
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.slices import cut_tetrahedra
 from petfsi.output.summary import Summary, read_summary, write_summary
@@ -313,13 +314,14 @@ def test_a_run_is_made_once_and_found_again(tmp_path):
 @pytest.mark.parallel([1, 3])
 def test_overwrite_removes_what_petfsi_wrote_and_nothing_else(tmp_path):
     path = shared_directory(tmp_path, comm) / "run"
-    run = RunDirectory.create(path, "first", "", overwrite=False, comm=comm)
+    run = RunDirectory.create(path, SCENE, "", overwrite=False, comm=comm)
     write_fields(path, 2, [0, 5])
     History(run.history, COLUMNS, comm).append(row(1))
     write_summary(run.summary, Summary("done", 1, 0.1), comm)
     if comm.rank == 0:
         run.log.write_text("a line")
-        plot_run(path)
+        for kind in FORMATS:
+            plot_run(path, kind=kind)
         (path / "notes.txt").write_text("mine")
         (path / "pictures" / "film.mp4").write_text("mine")
     comm.barrier()
@@ -381,7 +383,7 @@ def test_pictures_show_fluid_solid_and_obstacle(tmp_path, dim):
         history.append(row(step))
     drawn = plot_run(tmp_path)
     assert [p.name for p in drawn] == ["history.png", "000001.png", "000002.png"]
-    assert plot_run(tmp_path, every=2)[1:] == drawn[1:2]
+    assert plot_run(tmp_path, Wanted(every=2))[1:] == drawn[1:2]
     for path in drawn[1:]:
         assert coloured(path, (0x8C, 0x8C, 0x8C)) > 0.03, "the obstacle"
         assert coloured(path, (0xF3, 0xDC, 0xBD)) > 0.002, "the first body"

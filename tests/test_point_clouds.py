@@ -14,7 +14,8 @@ from output_cases import output, shared_directory, slabs
 from petfsi.errors import InputError
 from petfsi.fields.base import Slab
 from petfsi.output import pictures, stage
-from petfsi.output.fields import FieldWriter
+from petfsi.output.fields import FieldWriter, field_files
+from petfsi.output.frames import Wanted, read_frame
 from petfsi.output.manifest import Record
 from petfsi.output.pictures import plot_run
 from petfsi.output.slices import section
@@ -165,8 +166,8 @@ def around(dim, **sides):
         "room": {"shape": {"ball": {"centre": [0.5] * dim, "radius": 0.6}}, "outside": True},
     }
     obstacles = {name: Obstacle.model_validate(table) for name, table in shapes.items()}
-    fluid = SimpleNamespace(origin=zeros, size=ones, spacing=SPACING, smoothing=1.5, sides=SimpleNamespace(**sides))
-    return surroundings_of(SimpleNamespace(dim=dim, fluid=fluid, obstacles=obstacles, directory="."))
+    fluid = SimpleNamespace(origin=zeros, size=ones, resolution=SPACING, sides=SimpleNamespace(**sides))
+    return surroundings_of(SimpleNamespace(dim=dim, fluid=fluid, solids={}, obstacles=obstacles, directory="."))
 
 
 def test_the_surroundings_are_those_of_the_scene():
@@ -218,23 +219,23 @@ def test_a_particle_is_as_wide_as_its_spacing_and_coloured_by_what_is_asked(tmp_
     monkeypatch.setattr(stage, "read_surroundings", lambda _: around(2))
     write(tmp_path, 2, ROWS, on=MPI.COMM_SELF)
     for colour, top in (("pressure", 100.0), ("speed", 1.0)):
-        seen = stage.look_through(tmp_path, sorted((tmp_path / "fields").glob("0*.h5")), colour)
+        seen = stage.look_through(tmp_path, field_files(tmp_path), colour)
         assert (seen.shown, seen.spacing) == (colour, SPACING)
         assert seen.norm.vmax == pytest.approx(0.95 * top, rel=0.01)
-        frame = stage.read_frame(tmp_path / "fields" / "000010.h5")
+        frame = read_frame(tmp_path / "fields" / "000010.h5")
         ax = pictures.scene_figure(seen, frame).axes[0]
         (disks,) = [c for c in ax.collections if len(c.get_offsets()) == 70]
         assert disks.get_widths() == disks.get_heights() == pytest.approx([SPACING])
-        assert np.array_equal(disks.get_array(), stage.quantity(frame, colour))
-    with pytest.raises(InputError, match="--color smoke: the fields in .* have speed and pressure to show"):
-        plot_run(tmp_path, colour="smoke")
+        assert np.array_equal(disks.get_array(), seen.fluid_values(frame))
+    with pytest.raises(InputError, match="--quantity smoke: the fields in .* have speed and pressure to show"):
+        plot_run(tmp_path, Wanted(quantity="smoke"))
 
 
 def test_a_slice_of_space_is_two_spacings_thick(tmp_path, monkeypatch):
     monkeypatch.setattr(stage, "read_surroundings", lambda _: around(3))
     write(tmp_path, 3, [0], on=MPI.COMM_SELF)
     path = tmp_path / "fields" / "000000.h5"
-    frame = stage.read_frame(path)
+    frame = read_frame(path)
     figure = pictures.scene_figure(stage.look_through(tmp_path, [path]), frame)
     for ax in figure.axes[:2]:
         (disks,) = [c for c in ax.collections if c.get_array() is not None]

@@ -7,7 +7,7 @@ import struct
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -20,11 +20,12 @@ from PIL import Image
 from PIL.GifImagePlugin import getdata
 
 from petfsi.errors import InputError, PetfsiError
-from petfsi.output import files, hdf5
-from petfsi.output.fields import field_files
-from petfsi.output.pictures import BODIES, UNDRAWABLE, own_pictures, scene_figure
-from petfsi.output.stage import SHOWN, Stage, look_through, read_frame
-from petfsi.output.surroundings import GREY, LINE
+from petfsi.output import files
+from petfsi.output.frames import Wanted, read_frame, time_of, wanted_files
+from petfsi.output.pictures import own_pictures, reading, refuse_links, scene_figure
+from petfsi.output.plane import BODIES, WATER
+from petfsi.output.stage import Stage, look_through
+from petfsi.output.surroundings import GREY, HATCH, LINE
 
 #: Frames per second that a film has by itself: those of real time, within these bounds.
 SLOWEST, FASTEST = 5.0, 30.0
@@ -41,9 +42,8 @@ Pictures = Iterator[np.ndarray]
 def film_run(
     directory: Path,
     file: Path | None = None,
-    every: int = 1,
+    wanted: Wanted | None = None,
     fps: float | None = None,
-    colour: str | None = None,
 ) -> tuple[Path, int, float]:
     """Draw a film of a run, and return its file, the number of its frames and how many are shown per second.
 
@@ -56,29 +56,30 @@ def film_run(
     file : Path, optional
         What to write, or replace: a GIF, or by ffmpeg an MP4, as the ending says; ``pictures/film.gif`` of the run
         by default.
-    every : int
-        Show every so many output times.
+    wanted : Wanted, optional
+        Which times, and what is coloured; by default all, and the first quantity that varies.
     fps : float, optional
         Frames per second; by default as many as make the film last as long as what it shows, but at least ``SLOWEST``
         and at most ``FASTEST``.
-    colour : str, optional
-        What is coloured, as for ``plot_run``.
 
     Raises
     ------
     InputError
-        When there is nothing to show, a file is damaged, or the film cannot be of that kind, that speed or there.
+        When there is nothing to show, or nothing of what is wanted, a file is damaged, or the film cannot be of that
+        kind, that speed or there.
     """
-    directory = Path(directory)
+    directory, wanted = Path(directory), wanted or Wanted()
     file = Path(file) if file else directory / "pictures" / "film.gif"
     write = _writer(file)
     if fps is not None and not 0.0 < fps <= MOST:
         raise InputError(f"--fps {fps:g}: must be greater than 0 and at most {MOST:g} frames per second")
-    paths = field_files(directory)[::every]
+    refuse_links(directory)
+    with reading(directory):
+        paths = wanted_files(directory, wanted)
     if not paths:
         raise InputError(f"{directory} has no fields, so there is nothing to film (the scene's output.every sets them)")
-    with _reading(directory):
-        stage = look_through(directory, paths, colour)
+    with reading(directory):
+        stage = look_through(directory, paths, wanted.quantity)
         fps = fps or _real_time(paths)
     if file.parent == directory / "pictures":
         own_pictures(directory)
@@ -92,14 +93,6 @@ def film_run(
     finally:
         part.unlink(missing_ok=True)
     return file, len(paths), fps
-
-
-@contextmanager
-def _reading(directory: Path) -> Iterator[None]:
-    try:
-        yield
-    except UNDRAWABLE as error:
-        raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
 
 
 def _writer(file: Path) -> Callable[[Path, Pictures, float, Stage], None]:
@@ -116,17 +109,13 @@ def _writer(file: Path) -> Callable[[Path, Pictures, float, Stage], None]:
 
 def _real_time(paths: Sequence[Path]) -> float:
     """Return how many frames a second show a run as fast as it went, within bounds."""
-    times = []
-    for path in (paths[0], paths[-1]):
-        with hdf5.reading(path) as file:
-            times.append(float(file.attrs["time"]))
-    lasts = times[1] - times[0]
+    lasts = time_of(paths[-1]) - time_of(paths[0])
     return float(np.clip((len(paths) - 1) / lasts, SLOWEST, FASTEST)) if lasts > 0.0 else SLOWEST
 
 
 def _pictures(directory: Path, stage: Stage, paths: Sequence[Path]) -> Pictures:
     for path in paths:
-        with _reading(directory):
+        with reading(directory):
             frame = read_frame(path)
         figure = scene_figure(stage, frame)
         figure.set_dpi(_DPI)
@@ -182,15 +171,15 @@ def _change(before: np.ndarray | None, now: np.ndarray) -> tuple[tuple[int, int]
 
 def _palette(stage: Stage) -> np.ndarray:
     """Return the 256 colours of all frames: the scale's, those under arrows, of bodies in the light, and of lines."""
-    scale = matplotlib.colormaps[SHOWN[stage.shown][1]](np.linspace(0.0, 1.0, 150))[:, :3]
-    bodies = np.array([to_rgb(colour) for colour in BODIES])
+    scale = matplotlib.colormaps[stage.look.colours](np.linspace(0.0, 1.0, 140))[:, :3]
+    lit = scale[::34] if stage.of_solids else np.array([to_rgb(colour) for colour in BODIES])
     parts = [
         scale,
         0.4 * scale[::5] + 0.6,
-        (np.linspace(0.3, 1.0, 8)[:, None, None] * bodies).reshape(-1, 3),
+        (np.linspace(0.3, 1.0, 8)[:, None, None] * lit).reshape(-1, 3),
         np.linspace(0.0, 1.0, 24)[:, None] * np.ones(3),
         1.0 - np.linspace(0.2, 1.0, 8)[:, None] * (1.0 - np.array(to_rgb(LINE))),
-        [to_rgb(GREY)],
+        [to_rgb(colour) for colour in (GREY, HATCH, WATER)],
     ]
     colours = np.ones((256, 3))
     given = np.concatenate(parts)

@@ -2,44 +2,49 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
-from matplotlib.colors import LightSource, ListedColormap, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from scipy.ndimage import distance_transform_edt
+from matplotlib.ticker import ScalarFormatter
 
 from petfsi.errors import InputError
-from petfsi.fields.mac.grid.kinds import FLUID, OBSTACLE, OUTSIDE, SOLID
-from petfsi.geometry.surfaces import boundary_facets
 from petfsi.output import files
-from petfsi.output.fields import field_files
+from petfsi.output.frames import Frame, Wanted, read_frame, wanted_files, wanted_rows
 from petfsi.output.history import read_history
-from petfsi.output.slices import cut_tetrahedra
-from petfsi.output.stage import SHOWN, Frame, Stage, look_through, quantity, read_frame
-from petfsi.output.surroundings import GREY, LINE, draw_obstacles, draw_sides
+from petfsi.output.history_figure import history_figure
+from petfsi.output.plane import draw_plane
+from petfsi.output.slices import Plane
+from petfsi.output.space import draw_space
+from petfsi.output.stage import Stage, look_through
+from petfsi.output.surroundings import scene_of
 
-#: The colours of bodies, in turn.
-BODIES = ("#f3dcbd", "#c7dff0", "#d5ecc9", "#f2cdd6", "#e0d3ee")
-#: More edges than this are a dark stain, not a mesh.
-_MANY_EDGES = 6000
-#: Arrows along the longer side of a plane.
-_ARROWS = 30
+#: What pictures may be stored as.
+FORMATS = ("png", "pdf", "svg")
 _DPI = 130
+#: The largest a plane is drawn, and the room for its labels and a colour bar at its right or below, inches.
+_PLANE, _SMALLEST, _RIGHT, _BELOW = np.array([9.0, 7.5]), (3.6, 2.6), (1.9, 1.0), (1.0, 1.9)
+#: Planes that are so many times as long as high have the colour bar below.
+_FLAT = 3.0
+#: Numbers of a colour bar from 10^-3 to 10^4 are written out.
+_PLAIN = (-3, 4)
+#: Of two slices, a gap, for no layout knows of labels in space, and the view.
+_WIDTHS = (1.0, 1.0, 0.12, 1.1)
+#: How wide a colour bar may be beside a plane, inches.
+_BAR = 0.25
+#: What is nearer to zero than this part of a side is called zero.
+_ROUND = 1e-9
 #: What reading and drawing a file of ``fields/`` raise that petfsi has not written.
 UNDRAWABLE = (OSError, KeyError, ValueError, TypeError, IndexError, RuntimeError, AttributeError)
 
 
-def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list[Path]:
-    """Draw ``pictures/history.png`` and ``pictures/NNNNNN.png`` for every K-th output time, and return them.
+def plot_run(directory: Path, wanted: Wanted | None = None, kind: str = "png") -> list[Path]:
+    """Draw ``pictures/history.png`` and ``pictures/NNNNNN.png`` for the output times wanted, and return them.
 
     Colours and frames mean the same in all of them. Not collective.
 
@@ -47,41 +52,68 @@ def plot_run(directory: Path, every: int = 1, colour: str | None = None) -> list
     ----------
     directory : Path
         The run's.
-    every : int
-        Draw every so many output times.
-    colour : str, optional
-        What is coloured: smoke, speed, pressure or displacement; by default the first of these that varies.
+    wanted : Wanted, optional
+        Which times, and what is coloured; by default all, and the first quantity that varies.
+    kind : str
+        What they are stored as, of ``FORMATS``.
 
     Raises
     ------
     InputError
-        When there is nothing to draw, or a file is damaged.
+        When there is nothing to draw, or nothing of what is wanted, or a file is damaged.
     """
-    directory = Path(directory)
-    history, frames = directory / "history.csv", field_files(directory)[::every]
-    if not history.exists() and not frames:
+    directory, wanted = Path(directory), wanted or Wanted()
+    refuse_links(directory)
+    with reading(directory):
+        frames = wanted_files(directory, wanted)
+    history = directory / "history.csv"
+    if not frames and not history.exists():
         raise InputError(f"{directory} has neither history.csv nor fields, so there is nothing to draw")
+    if not frames and wanted.quantity is not None:
+        raise InputError(f"--quantity {wanted.quantity}: {directory} has no fields, so nothing can be coloured")
+    with reading(directory):
+        stage = look_through(directory, frames, wanted.quantity) if frames else None
+    panels = _history(directory, history, wanted, bool(frames))
     pictures = own_pictures(directory)
-    drawn = []
-    if history.exists():
-        drawn.append(_save(_history_figure(read_history(history)), pictures / "history.png"))
-    if frames:
-        try:
-            stage = look_through(directory, frames, colour)
+    drawn = [] if panels is None else [_save(panels, pictures / f"history.{kind}")]
+    if stage is not None:
+        with reading(directory):
             for frame in map(read_frame, frames):
-                drawn.append(_save(scene_figure(stage, frame), pictures / f"{frame.step:06d}.png"))
-        except UNDRAWABLE as error:
-            raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
+                drawn.append(_save(scene_figure(stage, frame), pictures / f"{frame.step:06d}.{kind}"))
     return drawn
 
 
-def own_pictures(directory: Path) -> Path:
-    """Return a run's folder of pictures, and make it; InputError where it, or that of its fields, is a link."""
-    fields, pictures = directory / "fields", directory / "pictures"
+def _history(directory: Path, path: Path, wanted: Wanted, others: bool) -> Figure | None:
+    """Return the figure of a history; None where it has nothing to show of those times, but the fields have."""
+    if not path.exists():
+        return None
+    table = read_history(path)
+    if others and "time" in table and not wanted.holds(table["time"]).any():
+        return None
+    return history_figure(wanted_rows(table, wanted), scene_of(directory))
+
+
+@contextmanager
+def reading(directory: Path) -> Iterator[None]:
+    """Say of which run it is that a file cannot be drawn."""
+    try:
+        yield
+    except UNDRAWABLE as error:
+        raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
+
+
+def refuse_links(directory: Path) -> None:
+    """Raise InputError where a run's folder of fields is a link."""
+    fields = directory / "fields"
     if fields.is_symlink():
         raise InputError(
             f"{fields} is a link, and petfsi follows none in a run directory; put what it names in its place"
         )
+
+
+def own_pictures(directory: Path) -> Path:
+    """Return a run's folder of pictures, and make it; InputError where it is a link."""
+    pictures = directory / "pictures"
     try:
         files.own_directory(pictures)
     except OSError as error:
@@ -91,42 +123,11 @@ def own_pictures(directory: Path) -> Path:
 
 def _save(figure: Figure, path: Path) -> Path:
     with open(files.new_file(path), "wb") as file:
-        figure.savefig(file, dpi=_DPI, format="png")
+        figure.savefig(file, dpi=_DPI, format=path.suffix[1:])
     return path
 
 
-# ---- history ------------------------------------------------------------------------------------------------
-
-
-def _history_figure(table: dict[str, np.ndarray]) -> Figure:
-    """Return every column over time: the components of a probe share a panel."""
-    panels: dict[str, list[str]] = {}
-    for name in table:
-        if name not in ("step", "time", "dt", "iterations", "residual"):
-            panels.setdefault(name.rpartition(".")[0] or name, []).append(name)
-    panels |= {name: [name] for name in ("iterations", "residual") if name in table}
-    figure = Figure(figsize=(8.0, 1.9 * len(panels) + 0.6), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)) if panels else []
-    for ax, (title, columns) in zip(axes, panels.items(), strict=True):
-        for column in columns:
-            values = table[column]
-            label = column.rpartition(".")[2] if len(columns) > 1 else None
-            ax.plot(
-                table["time"], values, lw=1.3, label=label, drawstyle="steps-post" if title == "iterations" else None
-            )
-        if title == "residual" and np.any(table["residual"] > 0):
-            ax.set_yscale("log")
-        if len(columns) > 1:
-            ax.legend(loc="best", ncols=len(columns), frameon=False, fontsize="small")
-        ax.set_ylabel(title)
-        ax.grid(alpha=0.3)
-        ax.margins(x=0)
-    if panels:
-        axes[-1].set_xlabel("time, s")
-    return figure
-
-
-# ---- drawing ------------------------------------------------------------------------------------------------
+# ---- a scene ------------------------------------------------------------------------------------------------
 
 
 def scene_figure(stage: Stage, frame: Frame) -> Figure:
@@ -136,176 +137,60 @@ def scene_figure(stage: Stage, frame: Frame) -> Figure:
 
 def _plane_figure(stage: Stage, frame: Frame) -> Figure:
     """Return the picture of a 2D scene."""
-    extent = stage.high - stage.low
-    scale = min(9.0 / extent[0], 7.5 / extent[1])
-    figure = Figure(
-        figsize=(max(3.6, extent[0] * scale + 1.9), max(2.6, extent[1] * scale + 1.0)), layout="constrained"
-    )
+    extent = (stage.high - stage.low) * stage.stretch
+    size = extent * np.min(_PLANE / extent)
+    flat = size[0] > _FLAT * size[1]
+    width, height = np.maximum(_SMALLEST, size + (_BELOW if flat else _RIGHT))
+    figure = Figure(figsize=(width, height), layout="compressed")
     ax = figure.subplots()
-    mappable = _draw_fluid(ax, stage, frame, (0, 1), None)
-    if frame.points is not None:
-        if mappable:
-            many = len(stage.cells) * 3 >= _MANY_EDGES
-            _draw_polygons(ax, list(frame.points[stage.cells]), _body_colours(stage), many)
-        else:
-            style: dict[str, Any] = {"shading": "gouraud", "cmap": SHOWN[stage.shown][1], "norm": deepcopy(stage.norm)}
-            x, y = frame.points.T
-            mappable = ax.tripcolor(x, y, np.asarray(quantity(frame, stage.shown)), triangles=stage.cells, **style)
-        border = boundary_facets(frame.points, stage.cells)
-        ax.add_collection(LineCollection(list(frame.points[border]), colors=LINE, lw=1.1))
-    _finish(ax, stage, (0, 1))
-    ax.set_title(f"t = {frame.time:.4g} s", fontsize="medium")
-    if mappable:
-        bar: dict[str, Any] = {"label": SHOWN[stage.shown][0], "extend": stage.extend}
-        figure.colorbar(mappable, ax=ax, aspect=30, shrink=0.9, **bar)
+    coloured = draw_plane(ax, stage, frame, Plane())
+    ax.set_title(_title(stage, frame, Plane()), fontsize="medium")
+    if coloured:
+        place: dict[str, Any] = {"location": "bottom"} if flat else {}
+        room = float(np.clip(_BAR / size[int(flat)], 0.1, 0.5))
+        place |= {"aspect": 30, "shrink": 0.9, "fraction": room}
+        _add_bar(figure, coloured, [ax], stage, place)
     return figure
 
 
 def _space_figure(stage: Stage, frame: Frame) -> Figure:
     """Return the picture of a 3D scene: two slices through the middle of the solids or the fluid, and a view."""
-    extent = stage.high - stage.low
+    extent = (stage.high - stage.low) * stage.stretch
     middle = stage.middle
     if frame.points is not None:
         middle = np.clip(frame.points.mean(axis=0), stage.low, stage.high)
-    n_panels = 2 if frame.points is None else 3
-    height = np.clip(4.4 * max(extent[1], extent[2]) / extent[0], 3.0, 7.0)
-    figure = Figure(figsize=(5.0 * n_panels, height + 1.6), layout="constrained")
-    places = figure.add_gridspec(1, n_panels)
-    mappable, panels = None, []
-    for place, across, axis in ((places[0, 0], (0, 1), 2), (places[0, 1], (0, 2), 1)):
-        ax = figure.add_subplot(place)
+    middle = np.where(np.abs(middle) < _ROUND * (stage.high - stage.low), 0.0, middle)
+    rigid = stage.around is not None and bool(stage.around.obstacles)
+    seen = rigid or frame.points is not None or bool(frame.particles)
+    height = np.clip(4.4 * max(extent[1], extent[2]) / extent[0], 2.4, 7.0)
+    figure = Figure(figsize=(15.5 if seen else 10.0, height + 1.6), layout="constrained")
+    places = figure.add_gridspec(1, 4 if seen else 2, width_ratios=_WIDTHS if seen else None)
+    coloured, panels = None, []
+    for n, (across, axis) in enumerate((((0, 1), 2), ((0, 2), 1))):
+        ax = figure.add_subplot(places[0, n])
         panels.append(ax)
-        mappable = _draw_fluid(ax, stage, frame, across, middle[axis])
-        if frame.points is not None:
-            polygons, owners = cut_tetrahedra(frame.points, stage.cells, axis, middle[axis])
-            _draw_polygons(ax, polygons, _body_colours(stage)[owners], len(polygons) * 3 >= _MANY_EDGES)
-        _finish(ax, stage, across)
-        ax.set_title(f"t = {frame.time:.4g} s, {'xyz'[axis]} = {middle[axis]:.3g} m", fontsize="medium")
-    if frame.points is not None:
-        _draw_surface(figure.add_subplot(places[0, 2], projection="3d"), stage, frame.points)
-    if mappable:
-        bar: dict[str, Any] = {"label": SHOWN[stage.shown][0], "extend": stage.extend}
-        figure.colorbar(mappable, ax=panels, shrink=0.6, location="bottom", aspect=50, **bar)
+        plane = Plane(across, float(middle[axis]))
+        coloured = draw_plane(ax, stage, frame, plane) or coloured
+        ax.set_title(_title(stage, frame, plane), fontsize="medium")
+    if seen:
+        draw_space(figure.add_subplot(places[0, 3], projection="3d"), stage, frame)
+    if coloured:
+        _add_bar(figure, coloured, panels, stage, {"location": "bottom", "shrink": 0.6, "aspect": 50})
     return figure
 
 
-def _draw_fluid(
-    ax: Axes, stage: Stage, frame: Frame, across: tuple[int, int], at: float | None
-) -> ScalarMappable | None:
-    """Draw the grid or the particles, and what is rigid, in the plane at ``at``; return what a colour bar needs."""
-    if stage.grid:
-        return _draw_cells(ax, stage, frame, across, at)
-    if stage.around:
-        draw_obstacles(ax, stage.around, across, at)
-        draw_sides(ax, stage.around, across)
-    return _draw_particles(ax, stage, frame, across, at) if frame.particles else None
+def _title(stage: Stage, frame: Frame, plane: Plane) -> str:
+    """Return the time, where the plane is, and along which axis it is drawn larger than along the other."""
+    text = f"t = {frame.time:.4g} s"
+    if plane.axis is not None:
+        text += f", {'xyz'[plane.axis]} = {plane.at:.3g} m"
+    stretch = stage.stretch[list(plane.across)]
+    if stretch.max() > stretch.min():
+        text += f"\n{'xyz'[plane.across[int(stretch.argmax())]]} stretched {stretch.max() / stretch.min():.3g} times"
+    return text
 
 
-def _draw_particles(
-    ax: Axes, stage: Stage, frame: Frame, across: tuple[int, int], at: float | None
-) -> ScalarMappable | None:
-    """Draw the particles as disks as wide as they are apart; of space those less than that away from the plane."""
-    x, colours = frame.particles["points"], quantity(frame, stage.shown)
-    if colours is None:
-        return None
-    if at is not None:
-        distance = np.abs(x[:, 3 - sum(across)] - at)
-        near = np.argsort(-distance, kind="stable")  # the nearest on top
-        near = near[distance[near] <= stage.spacing]
-        x, colours = x[near], colours[near]
-    # a norm of its own: those who watch one are miscounted where pictures that share it are collected
-    style: dict[str, Any] = {"cmap": SHOWN[stage.shown][1], "norm": deepcopy(stage.norm), "linewidths": 0.0}
-    size = [stage.spacing]
-    places: dict[str, Any] = {"units": "xy", "offsets": x[:, list(across)], "offset_transform": ax.transData}
-    disks = EllipseCollection(size, size, [0.0], array=colours, **places, **style)
-    ax.add_collection(disks, autolim=False)
-    return disks
-
-
-def _draw_cells(
-    ax: Axes, stage: Stage, frame: Frame, across: tuple[int, int], at: float | None
-) -> ScalarMappable | None:
-    """Draw the cells of the plane at ``at``, rigid things in grey; return what a colour bar needs."""
-    values, kind, flow = quantity(frame, stage.shown), frame.fluid.get("kind"), frame.fluid.get("velocity")
-    if at is not None and stage.grid:
-        axis = 3 - sum(across)
-        index = int(np.clip((at - stage.low[axis]) / stage.grid.spacing[axis], 0, stage.grid.cells[axis] - 1))
-        values, kind, flow = (None if a is None else np.take(a, index, axis=axis) for a in (values, kind, flow))
-    if values is None:
-        return None
-    if kind is not None and np.any(kind == SOLID) and np.any(np.isfinite(values)):
-        # the solid is drawn over these with its true outline; colour goes on beneath it instead of leaving stairs
-        nearest = distance_transform_edt(~np.isfinite(values), return_distances=False, return_indices=True)
-        values = np.where(kind == SOLID, values[tuple(nearest)], values)
-    a, b = across
-    extent = (stage.low[a], stage.high[a], stage.low[b], stage.high[b])
-    style: dict[str, Any] = {"origin": "lower", "extent": extent, "aspect": "equal", "interpolation": "nearest"}
-    image = ax.imshow(values.T, cmap=SHOWN[stage.shown][1], norm=deepcopy(stage.norm), **style)
-    if kind is not None:
-        rigid = np.where((kind == OBSTACLE) | (kind == OUTSIDE), 1.0, np.nan)
-        ax.imshow(rigid.T, cmap=ListedColormap([GREY]), **style)
-        if flow is not None and stage.shown == "speed":
-            _draw_arrows(ax, stage, np.where((kind == FLUID)[..., None], flow, np.nan)[..., list(across)], across)
-    return image
-
-
-def _draw_arrows(ax: Axes, stage: Stage, flow: np.ndarray, across: tuple[int, int]) -> None:
-    """Draw the velocity in a plane by some arrows, as long as their spacing where the flow is fastest."""
-    every = max(1, max(flow.shape[:2]) // _ARROWS)
-    sides = [
-        np.linspace(stage.low[a], stage.high[a], 2 * flow.shape[n] + 1)[1::2][every // 2 :: every]
-        for n, a in enumerate(across)
-    ]
-    some = flow[every // 2 :: every, every // 2 :: every]
-    gap = every * (stage.high[across[0]] - stage.low[across[0]]) / flow.shape[0]
-    style: dict[str, Any] = {
-        "color": "white",
-        "alpha": 0.6,
-        "width": 0.0018,
-        "angles": "xy",
-        "scale_units": "xy",
-        "pivot": "mid",
-    }
-    ax.quiver(*sides, some[..., 0].T, some[..., 1].T, scale=stage.norm.vmax / (1.3 * gap), **style)
-
-
-def _draw_polygons(ax: Axes, polygons: list[np.ndarray], colours: np.ndarray, many: bool) -> None:
-    # an edge in the colour of the face closes the hairlines between neighbours
-    ax.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours if many else LINE, lw=0.3))
-
-
-def _draw_surface(ax: Axes3D, stage: Stage, points: np.ndarray) -> None:
-    """Draw the solids' surface, shaded, in the box of the grid; y points up, as gravity does in most scenes."""
-    body_of_node = np.zeros(len(points), dtype=np.int64)
-    body_of_node[stage.cells] = stage.body[:, None]
-    facets = boundary_facets(points, stage.cells)
-    colours = _palette(body_of_node[facets[:, 0]])
-    light = LightSource(azdeg=27, altdeg=34)  # from (0.4, 0.8, 0.6)
-    style: dict[str, Any] = {
-        "facecolors": colours,
-        "edgecolors": colours,
-        "lw": 0.2,
-        "shade": True,
-        "lightsource": light,
-    }
-    ax.add_collection3d(Poly3DCollection(points[facets], **style))
-    ax.set(xlim=(stage.low[0], stage.high[0]), ylim=(stage.low[1], stage.high[1]), zlim=(stage.low[2], stage.high[2]))
-    ax.view_init(elev=20, azim=30, vertical_axis="y")
-    ax.set_box_aspect(stage.high - stage.low)  # after view_init, which decides what it means
-    ax.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
-    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
-        axis.set_major_locator(MaxNLocator(4))
-
-
-def _body_colours(stage: Stage) -> np.ndarray:
-    return _palette(stage.body)
-
-
-def _palette(body: np.ndarray) -> np.ndarray:
-    return np.array([to_rgb(colour) for colour in BODIES])[body % len(BODIES)]
-
-
-def _finish(ax: Axes, stage: Stage, across: tuple[int, int]) -> None:
-    a, b = across
-    ax.set(xlim=(stage.low[a], stage.high[a]), ylim=(stage.low[b], stage.high[b]), aspect="equal")
-    ax.set(xlabel=f"{'xyz'[a]}, m", ylabel=f"{'xyz'[b]}, m")
+def _add_bar(figure: Figure, coloured: ScalarMappable, panels: list[Axes], stage: Stage, place: dict[str, Any]) -> None:
+    numbers = ScalarFormatter()
+    numbers.set_powerlimits(_PLAIN)
+    figure.colorbar(coloured, ax=panels, label=stage.look.label, extend=stage.extend, format=numbers, **place)

@@ -40,7 +40,7 @@ _FILES += "fields.xdmf solid.xdmf fluid.xdmf particles.xdmf".split()
 _DIRECTORIES = {
     "fields": re.compile(r"(\d{6,}|mesh)\.h5(\.part)?|outputs\.csv(\.part)?"),
     "checkpoint": re.compile(r"\d{6,}\.(h5|json)(\.part)?"),
-    "pictures": re.compile(r"(\d{6,}|history)\.png|film\.gif(\.part)?"),
+    "pictures": re.compile(r"(\d{6,}|history)\.(png|pdf|svg)|film\.gif(\.part)?"),
 }
 
 

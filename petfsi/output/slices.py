@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 #: Which pairs of corners, sorted by height, the plane passes between when so many of four lie above it.
@@ -10,6 +12,31 @@ _CUT_EDGES = {
     2: np.array([(0, 2), (0, 3), (1, 3), (1, 2)]),
     3: np.array([(0, 1), (0, 2), (0, 3)]),
 }
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The plane of a picture.
+
+    Attributes
+    ----------
+    across : (int, int)
+        The axes along x and y of the picture.
+    at : float or None
+        Where it cuts the third axis, m; None in a scene of two.
+    """
+
+    across: tuple[int, int] = (0, 1)
+    at: float | None = None
+
+    @property
+    def axis(self) -> int | None:
+        """The axis that it cuts."""
+        return None if self.at is None else 3 - sum(self.across)
+
+    def cut(self, points: np.ndarray, facets: np.ndarray) -> list[np.ndarray]:
+        """Return the closed lines of a closed surface in it, as ``section`` does."""
+        return section(points, facets, self.axis, self.at or 0.0)
 
 
 def cut_tetrahedra(points: np.ndarray, cells: np.ndarray, axis: int, at: float) -> tuple[list[np.ndarray], np.ndarray]:
@@ -46,6 +73,39 @@ def cut_tetrahedra(points: np.ndarray, cells: np.ndarray, axis: int, at: float) 
         polygons.extend((1.0 - weight) * x[corner[:, edges[:, 0]]] + weight * x[corner[:, edges[:, 1]]])
         owners.append(cut)
     return polygons, np.concatenate(owners)
+
+
+def clip_triangles(triangles: np.ndarray, axis: int, at: float, sign: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what of triangles lies beyond, or before, the plane ``x[axis] = at``, and which of them each is of.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (n, 3, 3)
+    axis, at, sign : int, float, float
+        The plane, and 1 to keep what is above it, -1 for what is below.
+
+    Returns
+    -------
+    pieces : ndarray, shape (m, 3, 3)
+        Turned as the triangles that they are of.
+    owners : ndarray of int, shape (m,)
+    """
+    height = sign * (triangles[:, :, axis] - at)
+    above = height >= 0.0
+    count = above.sum(axis=1)
+    pieces, owners = [triangles[count == 3]], [np.flatnonzero(count == 3)]
+    for inside in (1, 2):
+        cut = np.flatnonzero(count == inside)
+        # the corner that is alone on its side comes first
+        alone = np.argmax(above[cut] == (inside == 1), axis=1)
+        order = (alone[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(triangles[cut], order[:, :, None], axis=1).swapaxes(0, 1)
+        h = np.take_along_axis(height[cut], order, axis=1)
+        ab, ac = (a + (h[:, :1] / (h[:, :1] - h[:, n : n + 1])) * (x - a) for n, x in ((1, b), (2, c)))
+        for piece in [(a, ab, ac)] if inside == 1 else [(ab, b, c), (ab, c, ac)]:
+            pieces.append(np.stack(piece, axis=1))
+            owners.append(cut)
+    return np.concatenate(pieces), np.concatenate(owners)
 
 
 def section(points: np.ndarray, facets: np.ndarray, axis: int | None, at: float) -> list[np.ndarray]:
