@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 from petfsi.errors import FinalError, NoSolutionError, SolveError, TouchError
 from petfsi.fields.base import SolidField
+from petfsi.scene.schema import Time
 from petfsi.solving.splitting import SplitWatch
 from petfsi.touch import WHY, Watch
 
@@ -78,3 +79,29 @@ def splitting_named(watch: SplitWatch | None) -> Iterator[None]:
             raise
         what = str(error).split(". ")[0].rstrip(".")
         raise FinalError(f"{said}. The step failed of it: {what}") from error
+
+
+def advice(time: Time, solid: SolidField | None, exact: bool, splitting: SplitWatch | None) -> str:
+    """Return what may help a run that blows up.
+
+    Parameters
+    ----------
+    time : Time
+        Of the scene.
+    solid : SolidField or None
+    exact : bool
+        Whether linearising once a step is not at fault: it is not done, or steps are explicit.
+    splitting : SplitWatch or None
+    """
+    if splitting is not None:
+        story = splitting.story()
+        other = "Try monolithic.opts, which tells splitting from the physics, a smaller dt, or more damping."
+        return f"{story[0].upper()}{story[1:]}." if story else other
+    if not time.scheme.inertia:
+        return "Try smaller steps of the load, by a smaller dt."
+    helps = ["a smaller dt"]
+    if solid is not None:
+        helps += [] if solid.is_linear or exact else ["-fsi_snes_type newtonls"]
+        helps += ["more damping"]
+        helps += [] if time.scheme.damps else ['time.integrator = "bdf2"']
+    return f"Try {' or '.join(filter(None, [', '.join(helps[:-1]), helps[-1]]))}."

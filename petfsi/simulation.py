@@ -9,12 +9,13 @@ from contextlib import contextmanager, suppress
 import numpy as np
 from mpi4py import MPI
 
-from petfsi import build, causes, petsc
+from petfsi import build, causes, limits, petsc
 from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
 from petfsi.errors import FinalError, InputError, NoSolutionError, NotStoredError, SolveError
-from petfsi.fields.base import FAR, Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
+from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
 from petfsi.guard import EnergyGuard
+from petfsi.probes import Probes
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 from petfsi.solving import start
@@ -31,9 +32,6 @@ from petfsi.touch import watch
 CLOCK = ("length", "step", "time")
 
 PHASES = ("predict", "couple", "assemble", "solve", "accept", "observe")
-
-#: Probed quantities that are numbers; the others are vectors.
-SCALARS = ("pressure", "smoke", "angle", "front", "level")
 
 #: The solution of a field without unknowns.
 NOTHING = np.zeros(0)
@@ -97,7 +95,9 @@ class Simulation:
         self.regions: ClosedRegions | None = None
         if isinstance(self.fluid, PressureFluid):
             self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
-        self._check_start()
+        if self.solid:
+            limits.refuse_far_start(self.solid)
+        self._probes = Probes(scene, self.solid, self.fluid)
         self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.guard = EnergyGuard(comm, scene)
@@ -356,14 +356,14 @@ class Simulation:
             self.volume_error = max(self.volume_error, self.regions.volume_error(dt))
         values = dict(zip((field.name for field in self.system.fields), self.system.values(), strict=True))
         if self.solid:
-            fastest = float(np.abs(self.solid.along_axes(values["solid"])).max(initial=0.0))
+            fastest = float(np.abs(self.solid.along_axes(values[self.solid.name])).max(initial=0.0))
             fastest = self._check_speed(self.solid, fastest, dt)
             if self.stable.limited:
                 self.stable.moved(fastest * dt)
-            self.solid.judge(values["solid"], dt)
+            self.solid.judge(values[self.solid.name], dt)
             if self.watch:
-                self.watch.judge(self.solid.surface_arrival(values["solid"], dt), t, dt)
-            self.solid.accept(values["solid"], t, dt)
+                self.watch.judge(self.solid.surface_arrival(values[self.solid.name], dt), t, dt)
+            self.solid.accept(values[self.solid.name], t, dt)
         for coupling in self.couplings:
             coupling.accept(values, t, dt)
         if self.fluid:
@@ -373,80 +373,25 @@ class Simulation:
         remarks = self.solid.remark(dt) if self.solid else None, self.fluid.remark() if self.fluid else None
         for remark in filter(None, remarks):
             self.report(f"t = {t + dt:.6g} s: {remark}")
-        self.accounts.update(values.get("pressure"), dt)
-
-    def _check_start(self) -> None:
-        """Refuse positions so far off that nothing is left of the body's shape there. Collective."""
-        if self.solid is None:
-            return
-        way = float(np.abs(self.solid.surface_present()).max(initial=0.0))
-        if not way < FAR * self.solid.extent:
-            raise InputError(
-                f"solids: a point begins {way:.3g} m from the origin, more than {FAR:g} times the largest side of the "
-                f"solids ({self.solid.extent:g} m): their shape is lost in the round-off of that"
-            )
+        self.accounts.update(values.get(self.fluid.name) if self.regions and self.fluid else None, dt)
 
     def _check_speed(self, solid: SolidField, fastest: float, dt: float) -> float:
-        """Return the largest speed of all ranks; raise if a node would cross the whole scene in one step. Collective.
-
-        Parameters
-        ----------
-        solid : SolidField
-        fastest : float
-            This rank's, m/s.
-        dt : float
-        """
-        # of what is no number the largest may be anything
-        fastest = self.comm.allreduce(fastest if np.isfinite(fastest) else np.inf, MPI.MAX)
-        extent = max(self.scene.fluid.size) if self.scene.fluid else 10.0 * solid.extent
-        if not fastest * dt < extent:
-            raise SolveError(
-                f"the solid has blown up: a node at {fastest:.2e} m/s would cross the whole scene ({extent:g} m) "
-                f"in one step of {dt:g} s. {self._advice()}"
-            )
-        return fastest
+        """Return the largest speed of all ranks, from this rank's (m/s); see ``limits``. Collective."""
+        extent = self.fluid.extent if self.fluid else 10.0 * solid.extent
+        return limits.largest_speed(self.comm, fastest, dt, extent, self._advice)
 
     def _advice(self) -> str:
         """Return what may help a run that blows up."""
-        if self.splitting is not None:
-            story = self.splitting.story()
-            other = "Try monolithic.opts, which tells splitting from the physics, a smaller dt, or more damping."
-            return f"{story[0].upper()}{story[1:]}." if story else other
-        if self.scene.time.integrator == "static":
-            return "Try smaller steps of the load, by a smaller dt."
-        helps = ["a smaller dt"]
-        if self.solid is not None:
-            linear = self.solid.is_linear or self.solver.iterates or self.stable.limited
-            helps += [] if linear else ["-fsi_snes_type newtonls"]
-            helps += ["more damping"]
-            helps += ['time.integrator = "bdf2"'] if self.scene.time.integrator == "midpoint" else []
-        return f"Try {' or '.join(filter(None, [', '.join(helps[:-1]), helps[-1]]))}."
+        limited = self.stable.limited
+        return causes.advice(self.scene.time, self.solid, self.solver.iterates or limited, self.splitting)
 
     def probe_columns(self) -> list[str]:
         """Return the names of the probes' columns in history.csv."""
-        return [name for name, _ in self._probe_values(lambda *_: np.zeros(self.scene.dim))]
+        return self._probes.columns()
 
     def probe(self) -> list[float]:
         """Return the probes' present values, one per column. Collective."""
-        return [value for _, value in self._probe_values(self._measure)]
-
-    def _measure(self, of: str, at: list[float] | None, quantity: str) -> np.ndarray | float:
-        if of == "fluid" or quantity == "force":
-            assert self.fluid is not None  # the scene was checked
-            return self.fluid.force_on(of) if quantity == "force" else self.fluid.probe(quantity, at or [])
-        assert self.solid is not None and at is not None
-        return self.solid.probe(of, at, quantity)
-
-    def _probe_values(self, measure: Callable) -> Iterator[tuple[str, float]]:
-        for name, spec in self.scene.probes.items():
-            try:
-                value = measure(spec.of, spec.at, spec.quantity)
-            except InputError as error:
-                raise InputError(f"probes.{name}: {error}") from None
-            if spec.quantity in SCALARS:
-                yield name, float(np.ravel(value)[0])
-            else:
-                yield from ((f"{name}.{axis}", float(v)) for axis, v in zip("xyz", value, strict=False))
+        return self._probes.values()
 
     def divergence(self) -> float:
         """Return the largest net outflow of a fluid cell in the last step, walls included, per face area, m/s.

@@ -267,11 +267,14 @@ class FluidField(Field):
         kg/m^3.
     cell_volume : float
         Volume of a typical cell, or of a particle at rest, m^3 (m^2 in 2D).
+    extent : float
+        The longest side of the box that it may fill, m.
     """
 
     comm: MPI.Comm
     density: float
     cell_volume: float
+    extent: float
 
     @abstractmethod
     def probe(self, quantity: str, at: list[float]) -> float | np.ndarray:

@@ -80,7 +80,8 @@ class SphFluid(FluidField):
         self.comm, self.scene, self.dim = comm, scene, scene.dim
         self.law, self.room = start.law, Room.of(scene, start.law)
         self.density, self.spacing = start.law.rho0, start.law.spacing
-        self.cell_volume = self.spacing**self.dim
+        assert scene.fluid is not None
+        self.cell_volume, self.extent = self.spacing**self.dim, max(scene.fluid.size)
         self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(scene.gravity or [])]
         constant = not any(g.depends_on_time for g in self._gravity)
         self._constant_gravity = self._gravity_at(0.0) if constant else None

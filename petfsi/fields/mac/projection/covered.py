@@ -87,7 +87,7 @@ class CoveredGrid(PressureFluid):
             raise InputError(f"fluid.cells = {fluid.cells}: a periodic axis needs at least 3 cells")
         self.grid = grid = MacGrid(comm, fluid.origin, fluid.size, fluid.cells, periodic)
         self.dim, self.density, self.layout = grid.dim, fluid.density, grid.layout
-        self.cell_volume, self.n_cells = grid.cell_volume, grid.layout.n_local
+        self.cell_volume, self.extent, self.n_cells = grid.cell_volume, max(fluid.size), grid.layout.n_local
         self.surroundings = Surroundings(grid, fluid)
         self.open_sides = OpenSides(grid, fluid.density, fluid.sides)
         self._cutter = self._make_cutter() if scene.cuts_cells else None
