@@ -8,7 +8,9 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.couplings.base import Coupling
-from petfsi.fields.base import Field, Reader, Slab, SolidField, Work, scalar_slab
+from petfsi.fields.base import Field, Work
+from petfsi.fields.slabs import Reader, Slab, scalar_slab
+from petfsi.fields.solids import SolidField
 from petfsi.force_work import ForceWork
 from petfsi.scene.schema import Scene
 from petfsi.solving.regions import ClosedRegions

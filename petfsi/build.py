@@ -5,7 +5,8 @@ from __future__ import annotations
 from mpi4py import MPI
 
 from petfsi.couplings.base import Coupling
-from petfsi.fields.base import Field, SolidField
+from petfsi.fields.base import Field
+from petfsi.fields.solids import SolidField
 from petfsi.registry import COUPLINGS, FLUIDS, JOINT, SOLIDS, find
 from petfsi.scene.schema import Scene
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from petfsi.errors import FinalError, NoSolutionError, SolveError, TouchError
-from petfsi.fields.base import SolidField
+from petfsi.fields.solids import SolidField
 from petfsi.scene.schema import Time
 from petfsi.solving.splitting import SplitWatch
 from petfsi.touch import WHY, Watch

@@ -8,7 +8,8 @@ import numpy as np
 
 from petfsi.couplings.base import Coupling
 from petfsi.errors import NotStoredError
-from petfsi.fields.base import Forces, Reader, Slab, SolidField
+from petfsi.fields.slabs import Reader, Slab
+from petfsi.fields.solids import Forces, SolidField
 from petfsi.integrators.base import Integrator
 
 

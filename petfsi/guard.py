@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 from petfsi.accounts import Accounts
 from petfsi.errors import SolveError
-from petfsi.fields.base import Reader, Slab, scalar_slab
+from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.stored import EXACT
 from petfsi.scene.expressions import Expression
 from petfsi.scene.schema import Scene

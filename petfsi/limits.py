@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import FAR, SolidField
+from petfsi.fields.solids import FAR, SolidField
 
 
 def refuse_far_start(solid: SolidField) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from petfsi.errors import InputError
-from petfsi.fields.base import FluidField, SolidField
+from petfsi.fields.fluids import FluidField
+from petfsi.fields.solids import SolidField
 from petfsi.scene.schema import Scene
 
 #: Probed quantities that are numbers; the others are vectors.

@@ -13,7 +13,10 @@ from petfsi import build, causes, limits, petsc
 from petfsi.accounts import Accounts
 from petfsi.couplings.base import Coupling
 from petfsi.errors import FinalError, InputError, NoSolutionError, NotStoredError, SolveError
-from petfsi.fields.base import Field, FluidField, PressureFluid, Reader, SolidField, State, held, scalar_slab
+from petfsi.fields.base import Field
+from petfsi.fields.fluids import FluidField, PressureFluid
+from petfsi.fields.slabs import Reader, State, held, scalar_slab
+from petfsi.fields.solids import SolidField
 from petfsi.guard import EnergyGuard
 from petfsi.probes import Probes
 from petfsi.scene.schema import Scene

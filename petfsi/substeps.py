@@ -8,7 +8,9 @@ from collections.abc import Iterator, Sequence
 from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import Field, Reader, Slab, SolidField, scalar_slab
+from petfsi.fields.base import Field
+from petfsi.fields.slabs import Reader, Slab, scalar_slab
+from petfsi.fields.solids import SolidField
 from petfsi.fields.stored import EXACT
 from petfsi.scene.schema import Time
 

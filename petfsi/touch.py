@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from petfsi.errors import TouchError
-from petfsi.fields.base import SolidField
+from petfsi.fields.solids import SolidField
 from petfsi.geometry.bodies import enclosed
 from petfsi.geometry.collisions import Meeting, Way, any_within, crossings
 from petfsi.geometry.obstacles import named_surfaces, side_walls

@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from processes import environment, launcher
 
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.output.xdmf import GridInfo
 
 #: A scene that pictures may be drawn of.

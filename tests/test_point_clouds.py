@@ -12,7 +12,7 @@ from mpi4py import MPI
 from output_cases import output, shared_directory, slabs
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.output import pictures, stage
 from petfsi.output.fields import FieldWriter, field_files
 from petfsi.output.frames import Wanted, read_frame

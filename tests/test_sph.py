@@ -10,7 +10,7 @@ from petsc4py import PETSc  # noqa: F401 - starts MPI's partner before the field
 from processes import environment
 
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.scene.load import scene_from_dict
 from petfsi.simulation import Simulation
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from petfsi.fields.base import Forces, Work
+from petfsi.fields.base import Work
+from petfsi.fields.solids import Forces
 
 if TYPE_CHECKING:
     from petfsi.couplings.enclosure import Enclosure

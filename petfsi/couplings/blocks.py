@@ -6,7 +6,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi.fields.base import FluidField, SolidField
+from petfsi.fields.fluids import FluidField
+from petfsi.fields.solids import SolidField
 from petfsi.petsc import new_block, set_csr
 
 #: This rank's rows of a matrix: indptr, global columns, values.

@@ -12,8 +12,9 @@ from scipy.sparse import csr_matrix
 from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.enclosure import Enclosure
 from petfsi.couplings.walls import WallCoupling
-from petfsi.fields.base import Forces, SolidField, Work
+from petfsi.fields.base import Work
 from petfsi.fields.mac.projection.slivers import outer_products
+from petfsi.fields.solids import Forces, SolidField
 from petfsi.fields.stored import outside, refuse
 from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix, diags, identity, kron
 
 from petfsi.couplings.blocks import Rows, TransferBlocks
-from petfsi.fields.base import SolidField
+from petfsi.fields.solids import SolidField
 from petfsi.fields.sph.fluid import SphFluid
 from petfsi.fields.sph.viscosity import ImplicitViscosity
 from petfsi.geometry.surfaces import Surface

@@ -30,7 +30,8 @@ from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.drag import Drag
-from petfsi.fields.base import SolidField, Work
+from petfsi.fields.base import Work
+from petfsi.fields.solids import SolidField
 from petfsi.fields.sph.fluid import SphFluid
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import gather_sums, gather_triplets

@@ -13,8 +13,9 @@ from scipy.sparse import csr_matrix
 from petfsi.couplings.blocks import Rows, TransferBlocks
 from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
 from petfsi.couplings.walls import WallCoupling
-from petfsi.fields.base import SolidField, Work
+from petfsi.fields.base import Work
 from petfsi.fields.mac.grid.kinds import FLUID, SOLID, SOLID_FACE, VOID
+from petfsi.fields.solids import SolidField
 from petfsi.geometry import rays
 from petfsi.geometry.surfaces import Surface
 from petfsi.petsc import IntType, gather_triplets

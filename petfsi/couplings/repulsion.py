@@ -39,7 +39,8 @@ from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
 from petfsi.couplings.particles import THETA
-from petfsi.fields.base import SolidField, Work
+from petfsi.fields.base import Work
+from petfsi.fields.solids import SolidField
 from petfsi.fields.sph.facets import contacts
 from petfsi.fields.sph.fluid import SphFluid
 from petfsi.geometry.surfaces import Surface

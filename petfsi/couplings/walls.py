@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from petfsi.couplings.base import Coupling
-from petfsi.fields.base import SolidField
+from petfsi.fields.solids import SolidField
 from petfsi.geometry.surfaces import Surface
 
 

@@ -10,10 +10,12 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix, vstack
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Forces, Landing, Reader, Slab, SolidField, Stock, Work
+from petfsi.fields.base import Stock, Work
+from petfsi.fields.slabs import Reader, Slab
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.partition import Fetch, slab
+from petfsi.fields.solids import Forces, Landing, SolidField
 from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.quadratic import Curved
 from petfsi.geometry.surfaces import Surface

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from petfsi.fields.base import Reader, Slab
+from petfsi.fields.slabs import Reader, Slab
 from petfsi.fields.stored import outside
 
 

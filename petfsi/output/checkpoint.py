@@ -23,7 +23,7 @@ from mpi4py import MPI
 
 import petfsi
 from petfsi.errors import InputError, NotStoredError, SolveError
-from petfsi.fields.base import Reader, Slab
+from petfsi.fields.slabs import Reader, Slab
 from petfsi.output import files, hdf5, stored_state
 from petfsi.output.manifest import FORMAT, HEAD, MAX_BYTES, Manifest, Mark, Record, read_manifest
 from petfsi.ranks import on_root

@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import SolveError
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.output import checkpoint, files, hdf5, xdmf
 from petfsi.output.growing import Changed, GrowingXml
 from petfsi.output.manifest import Index, Mark, Record, Rows

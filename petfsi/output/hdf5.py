@@ -27,7 +27,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import PetfsiError
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.output import files
 from petfsi.ranks import agree, on_root
 

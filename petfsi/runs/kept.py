@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.fields.base import State
+from petfsi.fields.slabs import State
 from petfsi.simulation import Simulation
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Reader
+from petfsi.fields.slabs import Reader
 from petfsi.integrators.base import integrator
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output import files

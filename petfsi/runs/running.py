@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from petfsi import __version__
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.fields import FieldWriter
 from petfsi.output.history import History, column_names

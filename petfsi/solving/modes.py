@@ -15,7 +15,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from petfsi.errors import SolveError
-from petfsi.fields.base import SolidField
+from petfsi.fields.solids import SolidField
 from petfsi.solving.system import System
 
 #: Bodies lighter than this part of the fluid have modes.

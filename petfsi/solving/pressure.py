@@ -7,7 +7,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.base import PressureFluid, SolidField
+from petfsi.fields.fluids import PressureFluid
+from petfsi.fields.solids import SolidField
 from petfsi.solving.modes import DEGREE, LIGHT, LINEAR, MOST, Modes
 from petfsi.solving.multigrid import Hierarchy, Multigrid
 from petfsi.solving.preconditioners import DEFAULTS, read_options

@@ -12,7 +12,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
-from petfsi.fields.base import PressureFluid, Reader, Slab, SolidField, State
+from petfsi.fields.fluids import PressureFluid
+from petfsi.fields.slabs import Reader, Slab, State
+from petfsi.fields.solids import SolidField
 from petfsi.fields.stored import outside, refuse
 from petfsi.solving.lasting import TABLES, Tracked, bounded_most, looked_up, meeting, pairs
 from petfsi.solving.system import System

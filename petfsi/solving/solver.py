@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from petfsi import petsc, releases
 from petfsi.errors import InputError, SolveError, is_memory
-from petfsi.fields.base import PressureFluid
+from petfsi.fields.fluids import PressureFluid
 from petfsi.ranks import on_root
 from petfsi.solving import option_database, options
 from petfsi.solving.multigrid import Hierarchy

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import FinalError
-from petfsi.fields.base import Reader, Slab, scalar_slab
+from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.stored import EXACT
 from petfsi.solving.system import System
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from petfsi.errors import SolveError
-from petfsi.fields.base import PressureFluid, SolidField
+from petfsi.fields.fluids import PressureFluid
+from petfsi.fields.solids import SolidField
 from petfsi.solving import solver as solve
 from petfsi.solving.regions import ClosedRegions
 from petfsi.solving.solver import Solver

@@ -9,9 +9,9 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Slab
 from petfsi.fields.beam.elements import THEORIES, WIDTH, BeamElements, Sections
 from petfsi.fields.beam.loads import AxisPlace, BeamLoads
+from petfsi.fields.slabs import Slab
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.partition import slab
 from petfsi.geometry.beams import (

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Reader, Slab, Stock, Work, scalar_slab
+from petfsi.fields.base import Stock, Work
 from petfsi.fields.mac import budget, views
 from petfsi.fields.mac.carrying import advect
 from petfsi.fields.mac.carrying.extrapolate import FAR, Band
@@ -26,6 +26,7 @@ from petfsi.fields.mac.projection.covered import CoveredGrid
 from petfsi.fields.mac.projection.weight import Weight
 from petfsi.fields.mac.walls.parts import Parts
 from petfsi.fields.replicated import read_whole, whole_slab
+from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.ranks import agreed
 from petfsi.scene import fluids

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from petfsi.errors import InputError
-from petfsi.fields.base import Slab
 from petfsi.fields.mac.carrying.advect import velocity_at
 from petfsi.fields.mac.carrying.sheets import Sheets
 from petfsi.fields.mac.grid.grid import MacGrid, three
 from petfsi.fields.mac.grid.kinds import DEAD, FLUID
+from petfsi.fields.slabs import Slab
 from petfsi.geometry.sight import seen_from
 
 

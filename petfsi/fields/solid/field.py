@@ -12,7 +12,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi.errors import InputError
-from petfsi.fields.base import FAR, Forces, Landing, Reader, Slab, SolidField, Stock, Work, scalar_slab
+from petfsi.fields.base import Stock, Work
+from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.solid.conflicts import conflicts
 from petfsi.fields.solid.edges import Edges
 from petfsi.fields.solid.elements import State
@@ -26,6 +27,7 @@ from petfsi.fields.solid.shrinkage import Shrinkage
 from petfsi.fields.solid.spectrum import largest_eigenvalue
 from petfsi.fields.solid.supports import Elimination, Supports
 from petfsi.fields.solid.turning import Turning, bodies_of
+from petfsi.fields.solids import FAR, Forces, Landing, SolidField
 from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.places import Tags, read_tags, with_middles

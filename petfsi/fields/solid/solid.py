@@ -9,7 +9,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from petfsi.errors import InputError, SolveError
-from petfsi.fields.base import Slab
+from petfsi.fields.slabs import Slab
 from petfsi.fields.solid.elements import Bodies, Elements
 from petfsi.fields.solid.field import NodalSolid
 from petfsi.fields.solid.loads import Body, Loads

@@ -19,8 +19,10 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import SolveError
-from petfsi.fields.base import FluidField, Reader, Slab, State, Stock, Work, held
+from petfsi.fields.base import Stock, Work
+from petfsi.fields.fluids import FluidField
 from petfsi.fields.replicated import read_whole, whole_slab
+from petfsi.fields.slabs import Reader, Slab, State, held
 from petfsi.fields.sph import moves, probes
 from petfsi.fields.sph.balance import bisect
 from petfsi.fields.sph.bodies import Bodies

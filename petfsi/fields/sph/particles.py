@@ -10,7 +10,7 @@ from mpi4py import MPI
 from numba import njit
 
 from petfsi.errors import SolveError
-from petfsi.fields.base import Reader, Slab, State, scalar_slab
+from petfsi.fields.slabs import Reader, Slab, State, scalar_slab
 from petfsi.fields.sph.balance import Boxes, bisect, is_better, is_uneven, located, seen
 from petfsi.fields.sph.cells import CellGrid, sorted_rows
 from petfsi.fields.sph.transport import Packing, Traffic, ship

@@ -9,8 +9,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from petfsi.fields.base import Reader, Slab
 from petfsi.fields.mac.grid.halo import Halo, ranks_per_axis
+from petfsi.fields.slabs import Reader, Slab
 from petfsi.petsc import IntType, Layout
 
 #: Ghost layers: a departure point up to four cells away, half a cell of staggering, and its interpolation.

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.errors import InputError
-from petfsi.fields.base import PressureFluid
+from petfsi.fields.fluids import PressureFluid
 from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.grid import MacGrid, three
 from petfsi.fields.mac.grid.sides import Surroundings, periodic_axes

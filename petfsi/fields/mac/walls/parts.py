@@ -15,9 +15,9 @@ from itertools import product
 
 import numpy as np
 
-from petfsi.fields.base import Reader, Slab
 from petfsi.fields.mac.grid.grid import MacGrid
 from petfsi.fields.replicated import read_whole, whole_slab
+from petfsi.fields.slabs import Reader, Slab
 from petfsi.fields.stored import EXACT, outside
 
 
