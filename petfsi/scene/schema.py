@@ -15,7 +15,7 @@ from pydantic_core import PydanticCustomError
 from petfsi.integrators import INTEGRATORS
 from petfsi.registry import COUPLINGS, MATERIALS
 from petfsi.scene.fluids import Fluid
-from petfsi.scene.tables import Flag, Number, Real, Shape, Table, Vector, Whole, one_of
+from petfsi.scene.tables import Flag, GroupName, Number, Real, Shape, Table, Vector, Whole, one_of
 
 Component = Literal["x", "y", "z", "angle"]
 Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
@@ -61,7 +61,7 @@ class Damping(Table):
 class Tagged(Table):
     """A group of boundary facets or of nodes that a mesh file has a name (or a number) for."""
 
-    tag: Annotated[str, Field(min_length=1, description="the name of a group of facets or nodes in the mesh file")]
+    tag: Annotated[GroupName, Field(description="the name of a group of facets or nodes in the mesh file")]
 
 
 def _where_form(value: Any) -> str:

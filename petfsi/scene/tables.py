@@ -21,6 +21,11 @@ def _number_or_text(value: Any) -> Any:
     return value
 
 
+def _name_of_number(value: Any) -> Any:
+    """Return the name that a whole number stands for."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 10**18 else value
+
+
 def one_of(names: Collection[str], optional: bool = False) -> Callable[[Any], str | None]:
     """Return a validator of names that are registered elsewhere, which speaks as those of literals do."""
     quoted = [f"'{name}'" for name in names]
@@ -42,6 +47,8 @@ Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 Vector = list[Real]
 Cells = list[Annotated[Whole, Field(ge=1)]]
+#: The name of a group in a mesh file, or its number.
+GroupName = Annotated[str, Field(min_length=1), BeforeValidator(_name_of_number)]
 #: A number, or an expression of x, y, z, t and pi (see ``expressions.py``).
 Number = Annotated[float | str, BeforeValidator(_number_or_text)]
 
@@ -97,15 +104,15 @@ class Beam(Table):
 
 
 class Shape(Table):
-    """Exactly one of the shapes; ``mesh`` is a file that meshio reads, relative to the scene."""
+    """Exactly one of the shapes; ``mesh`` is a mesh file, relative to the scene."""
 
     box: Box | None = None
     ball: Ball | None = None
     cylinder: Cylinder | None = None
     halfspace: Halfspace | None = None
     beam: Beam | None = None
-    mesh: Annotated[str | None, Field(description="a file that meshio reads")] = None
-    cells: Annotated[str | None, Field(min_length=1, description="which group of a mesh file's cells")] = None
+    mesh: Annotated[str | None, Field(description="a mesh file")] = None
+    cells: Annotated[GroupName | None, Field(description="which group of a mesh file's cells")] = None
     scale: Annotated[Real, Field(gt=0, description="factor on a mesh file's coordinates")] = 1.0
     translate: Annotated[Vector | None, Field(description="m, applied to a mesh file after scaling")] = None
     cavity: Annotated[Box | None, Field(description="cells of a meshed box with their centre in it are left out")] = (
