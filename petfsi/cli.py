@@ -184,6 +184,7 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
     def work() -> int:
         import numpy as np
 
+        from petfsi.geometry.mesh_files import read_once
         from petfsi.runs.memory import refuse_too_large
         from petfsi.runs.plan import describe_plan, is_rehearsed
         from petfsi.scene.load import load_scene
@@ -191,7 +192,8 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...]) -> NoReturn:
         petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
         refuse_too_large(loaded)
-        with np.errstate(all="ignore"):  # what overflows is told of by those who judge what it gives
+        # what overflows is told of by those who judge what it gives
+        with np.errstate(all="ignore"), read_once():
             plan = describe_plan(loaded, petsc)
             if is_rehearsed(loaded):
                 _start_petsc(petsc)

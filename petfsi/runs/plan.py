@@ -86,7 +86,7 @@ def _default_options(scene: Scene, nodes: dict[str, int]) -> str:
 
 
 def mesh_notes(scene: Scene) -> list[str]:
-    """Return what a user should know of how mesh files are read. Not collective; reads them again."""
+    """Return what a user should know of how mesh files are read. Not collective; see ``read_once``."""
     shapes = [solid.shape for solid in scene.solids.values()] + [one.shape for one in scene.obstacles.values()]
     if all(shape.mesh is None for shape in shapes):
         return []

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from petfsi import __version__
 from petfsi.errors import InputError
+from petfsi.geometry.mesh_files import read_once
 from petfsi.messages import shown
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.lock import held, refuse_if_held
@@ -59,14 +60,16 @@ def run_scene(
     on_root(comm, lambda: refuse_if_held(out))
     origin = Origin.find(source, out, comm) if source is not None else None
     meshes = on_root(comm, lambda: mesh_files(scene))
-    simulation, unread, options = made_ready(comm, scene, petsc_args, origin)
+    with read_once():
+        simulation, unread, options = made_ready(comm, scene, petsc_args, origin)
+        notes = on_root(comm, lambda: mesh_notes(scene))
     text = dump_scene(scene, own_names([mesh.mark for mesh in meshes], out))
     with held(out, comm, make=True) as lock:
         files = RunDirectory.create(out, text, options.dump(), overwrite, comm, meshes)
         leg = _leg(simulation, sets, petsc_args, origin=None if origin is None else origin.mark)
         known = on_root(comm, lambda: files.first_record(meshes, leg))
         with Console(comm.rank, files.log, total=_total(simulation, steps)) as console:
-            _greet(console, simulation, options, unread)
+            _greet(console, simulation, options, unread, notes)
             run = Run(simulation, files, console, known, lock)
             with run.recorded():
                 run.open()
@@ -101,9 +104,10 @@ def resume_run(
             raise InputError(f"{directory} does not fit its checkpoint {found.path.name}; nothing was changed:{lines}")
         scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
         options = solve.load_options(petsc_args, stored=files.options)
-        simulation = Simulation(comm, scene)
-        # of the scene's start: it would move the fluid's faces to the restored solid
-        unread = simulation.prepare(resumes_at=found.time)
+        with read_once():
+            simulation = Simulation(comm, scene)
+            # of the scene's start: it would move the fluid's faces to the restored solid
+            unread = simulation.prepare(resumes_at=found.time)
         _restore(simulation, found)
         text = dump_scene(scene, own_names(list(known.meshes), directory))
         changes = find_changes(known.settings, text, options.dump())
@@ -172,13 +176,14 @@ def _total(simulation: Simulation, steps: int | None) -> int | None:
     return min(known, default=None)
 
 
-def _greet(console: Console, simulation: Simulation, options: Options, unread: list[str]) -> None:
+def _greet(
+    console: Console, simulation: Simulation, options: Options, unread: list[str], meshes: Sequence[str] = ()
+) -> None:
     size = ", ".join(f"{name} {n:,}" for name, n in simulation.system.unknowns.items())
     title = shown(simulation.scene.title, 200) or "untitled"
     console.note(f"petfsi {__version__}: {title}; unknowns: {size}; ranks: {simulation.comm.size}")
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
-    told.append(on_root(simulation.comm, lambda: mesh_notes(simulation.scene)) if simulation.step == 0 else [])
-    for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:
+    for note in [*options.notes, *chain.from_iterable(told), *meshes, *simulation.notes]:
         console.note(note)
     for name in unread:
         console.warn(f"option -{name} was read by nothing")
