@@ -192,6 +192,7 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
     def work() -> int:
         import numpy as np
 
+        from petfsi.geometry.mesh_files import read_once
         from petfsi.runs.memory import refuse_too_large
         from petfsi.runs.plan import describe_plan
         from petfsi.scene.load import load_scene
@@ -199,7 +200,8 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
         petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
         refuse_too_large(loaded)
-        with np.errstate(all="ignore"):  # what overflows is told of by those who judge what it gives
+        # what overflows is told of by those who judge what it gives
+        with np.errstate(all="ignore"), read_once():
             plan = describe_plan(loaded, petsc, None if quick else lambda: _ready(loaded, petsc))
         _say(plan)
         return 0

@@ -340,7 +340,11 @@ BROKEN = [
     ),
     (["solids.layer.supports.0.where={mesh='a.stl'}"], "supports.0.where.mesh", "must be a box, ball"),
     (["solids.layer.supports.0.where={tag='foot'}"], 'where.tag = "foot"', "a tag is a mesh file's, and the solid's"),
-    (["solids.layer.supports.0.where={tag=1}"], "supports.0.where.tag = 1", "must be a text in quotes (the name of a"),
+    (
+        ["solids.layer.supports.0.where={tag=true}"],
+        "supports.0.where.tag = true",
+        "must be a text in quotes (the name of a",
+    ),
     (["solids.layer.supports.0.where={tag=''}"], 'supports.0.where.tag = ""', "must not be empty"),
     (
         ["solids.layer.supports.0.displacement={x = 1.0}"],

@@ -19,8 +19,8 @@ from petfsi.errors import SolveError
 from petfsi.fields.mac.fluid import MacFluid
 from petfsi.fields.mac.grid.kinds import OPEN, PRESSURE, SPLIT
 from petfsi.fields.mac.grid.sides import wrapped_points
-from petfsi.geometry.meshes import SIMPLEX
 from petfsi.geometry.obstacles import obstacle_surface
+from petfsi.geometry.splitting import SIMPLEX
 from petfsi.ranks import on_root
 from petfsi.scene.load import scene_from_dict
 from petfsi.scene.schema import Obstacle, Scene

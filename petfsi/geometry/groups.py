@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,22 +16,24 @@ if TYPE_CHECKING:
 _NUMBERS = ("gmsh:physical", "medit:ref", "cell_tags", "point_tags")
 #: What numbers else there may be and mean something else.
 _NO_GROUPS = ("gmsh:geometrical", "gmsh:dim_tags", "obj:group_ids")
+#: Numbers that have more values than this are no groups.
+MOST = 10_000
 
 
 def cell_groups(mesh: meshio.Mesh, dim: int) -> dict[str, list[np.ndarray]]:
-    """Return the groups of cells of a dimension: by name, of every block which of its cells are in it.
+    """Return the groups of cells of a dimension: by name, the numbers of those in it within each block.
 
     Names are those of the format's sets and of gmsh's physical groups; numbers without a name stand for themselves.
     Where no array is known to hold groups, the only array of whole numbers does, as in FEniCS's files.
     """
     names = {int(tag): name for name, (tag, of) in mesh.field_data.items() if int(of) == dim}
-    empty = [np.zeros(len(block.data), dtype=bool) for block in mesh.cells]
     fits = [block.type in KINDS and KINDS[block.type].dim == dim for block in mesh.cells]
     groups: dict[str, list[np.ndarray]] = {}
 
     def add(name: str, n: int, chosen: np.ndarray) -> None:
         if fits[n] and len(chosen):
-            groups.setdefault(name, [mask.copy() for mask in empty])[n][chosen] = True
+            of = groups.setdefault(name, [np.zeros(0, dtype=np.int64)] * len(fits))
+            of[n] = np.union1d(of[n], chosen) if len(of[n]) else np.asarray(chosen, dtype=np.int64)
 
     for name, sets in mesh.cell_sets.items():
         for n, chosen in enumerate(sets):
@@ -38,11 +41,10 @@ def cell_groups(mesh: meshio.Mesh, dim: int) -> dict[str, list[np.ndarray]]:
                 add(name, n, np.asarray(chosen))
     tags = _numbers(mesh.cell_data)
     for n in range(len(mesh.cells)) if tags else ():
-        values = np.asarray(mesh.cell_data[tags][n])
-        for value in np.unique(values[values != 0]).tolist() if fits[n] else ():
-            for name in _named(names, getattr(mesh, "cell_tags", None), int(value)):
-                add(name, n, np.flatnonzero(values == value))
-    return {name: masks for name, masks in groups.items() if any(mask.any() for mask in masks)}
+        for value, chosen in _by_number(mesh.cell_data[tags][n]) if fits[n] else ():
+            for name in _named(names, getattr(mesh, "cell_tags", None), value):
+                add(name, n, chosen)
+    return groups
 
 
 def point_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
@@ -50,12 +52,21 @@ def point_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
     names = {int(tag): name for name, (tag, of) in mesh.field_data.items() if int(of) == 0}
     groups = {name: np.asarray(points, dtype=np.int64).ravel() for name, points in mesh.point_sets.items()}
     tags = next((name for name in _NUMBERS if name in mesh.point_data), None)
-    if tags:
-        values = np.asarray(mesh.point_data[tags])
-        for value in np.unique(values[values != 0]).tolist():
-            for name in _named(names, getattr(mesh, "point_tags", None), int(value)):
-                groups.setdefault(name, np.flatnonzero(values == value))
+    for value, chosen in _by_number(mesh.point_data[tags]) if tags else ():
+        for name in _named(names, getattr(mesh, "point_tags", None), value):
+            groups.setdefault(name, chosen)
     return groups
+
+
+def _by_number(values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield each number but 0 and where it stands; none of so many that they cannot mean groups."""
+    values = np.asarray(values)
+    order = np.argsort(values, kind="stable")
+    found, first = np.unique(values[order], return_index=True)
+    if 0 < len(found) <= MOST:
+        for value, chosen in zip(found, np.split(order, first[1:]), strict=True):
+            if value != 0 and np.isfinite(value):
+                yield int(value), chosen
 
 
 def _numbers(data: dict[str, list[np.ndarray]]) -> str | None:

@@ -1,41 +1,75 @@
-"""Mesh files through the readers that others keep: meshio, and trimesh for surfaces that it cannot read."""
+"""Mesh files: what their readers make of them, within time and memory, and one clear error where they make nothing."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Hashable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 import numpy as np
 
+from petfsi.bounded import TooLongError, bounded
 from petfsi.errors import InputError
+from petfsi.geometry.splitting import KINDS
 from petfsi.messages import shown
 from petfsi.scene.tables import Shape
 
 if TYPE_CHECKING:
     import meshio
 
-#: Plane and solid elements of Abaqus that meshio has no name for: how they integrate is none of a mesh's business.
-_ABAQUS = {
-    "triangle": ("CPE3", "CPE3H", "CPS3", "M3D3", "DC2D3", "CPEG3"),
-    "triangle6": ("CPE6", "CPE6H", "CPE6M", "CPS6", "CPS6M", "M3D6", "DC2D6", "CPEG6"),
-    "quad": ("CPE4", "CPE4H", "CPE4I", "CPE4R", "CPE4RH", "CPS4", "CPS4I", "CPS4R", "M3D4", "DC2D4", "CPEG4"),
-    "quad8": ("CPE8", "CPE8H", "CPE8R", "CPE8RH", "CPS8", "CPS8R", "M3D8", "DC2D8"),
-    "tetra": ("C3D4", "C3D4H", "DC3D4"),
-    "tetra10": ("C3D10", "C3D10H", "C3D10M", "C3D10MH", "C3D10I", "DC3D10"),
-    "pyramid": ("C3D5", "C3D5H"),
-    "wedge": ("C3D6", "C3D6H", "DC3D6"),
-    "wedge15": ("C3D15", "C3D15H", "DC3D15"),
-    "hexahedron": ("C3D8", "DC3D8"),
-    "hexahedron20": ("C3D20", "DC3D20"),
-}
-#: Formats of surfaces that trimesh reads.
-_SURFACES = (".obj", ".off", ".ply", ".stl")
+    from petfsi.geometry.readers.formats import Reader
+
+#: What a reader may take: so long, s, and for each byte of the file; the slowest wants 1.5e-7 s/B.
+SECONDS, SECONDS_PER_BYTE = 20.0, 2e-6
+#: So much memory, bytes, and times the file; the hungriest, of compressed cells, wants 38 times that.
+MEMORY, MEMORY_PER_BYTE = 1e9, 60.0
+
+T = TypeVar("T")
+_WAY_OUT = "save it as Gmsh 4.1 (.msh) or VTU (.vtu), a surface as STL, too"
 
 
-def open_mesh(shape: Shape, key: str, directory: Path) -> meshio.Mesh:
+class Opened(NamedTuple):
+    """What was made of a file, and what its user should know of that."""
+
+    mesh: meshio.Mesh
+    notes: tuple[str, ...]
+
+
+#: What was made of files while ``read_once`` lasts, or the error that came of it.
+_kept: ContextVar[dict[Hashable, object] | None] = ContextVar("kept", default=None)
+
+
+@contextlib.contextmanager
+def read_once() -> Iterator[None]:
+    """Read each file once while this lasts: nothing may change it."""
+    token = _kept.set({})
+    try:
+        yield
+    finally:
+        _kept.reset(token)
+
+
+def once(what: Hashable, make: Callable[[], T]) -> T:
+    """Return what ``make`` returns, or raise what it raises; where reading is done once, what it did for the same."""
+    kept = _kept.get()
+    if kept is None:
+        return make()
+    if what not in kept:
+        try:
+            kept[what] = make()
+        except InputError as error:
+            kept[what] = error
+    found = kept[what]
+    if isinstance(found, InputError):
+        raise found
+    return cast(T, found)
+
+
+def open_mesh(shape: Shape, key: str, directory: Path) -> Opened:
     """Return what a reader makes of a shape's file; whatever it does to say no becomes one InputError. Not collective.
 
     Parameters
@@ -50,48 +84,96 @@ def open_mesh(shape: Shape, key: str, directory: Path) -> meshio.Mesh:
     path = Path(directory) / str(shape.mesh)
     if not path.is_file():
         raise InputError(f"{key} = {shape.mesh!r}: no file {path}")
-    readers: list[Callable[[Path], meshio.Mesh]] = [_by_meshio]
-    if path.suffix.lower() in _SURFACES:
-        readers.append(_by_trimesh)
+    found = once(path, lambda: _opened(path))
+    if isinstance(found, str):
+        raise InputError(f"{key} = {shape.mesh!r}: {found}")
+    return found
+
+
+def _opened(path: Path) -> Opened | str:
+    """Return what the first reader that can makes of a file, or why none can."""
+    from petfsi.geometry.readers.formats import endings, find_readers
+
+    size = path.stat().st_size
+    if not size:
+        return "cannot be read as a mesh: it is empty"
+    readers = find_readers(path)
+    if not readers:
+        return f"cannot be read as a mesh: such files end in {', '.join(endings())}; {_WAY_OUT}"
     first = ""
-    for read in readers:
-        said = io.StringIO()
-        try:
-            # on a broken file some readers print, warn or even exit
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                return read(path)
-        except (Exception, SystemExit) as error:
-            why = str(error) if isinstance(error, Exception) else ""
-            first = first or " ".join(f"{why} {said.getvalue()}".split()) or type(error).__name__
-    raise InputError(f"{key} = {shape.mesh!r}: cannot be read as a mesh ({shown(first, 300)})")
+    for name, read in readers:
+        found = _tried(read, path, size)
+        if isinstance(found, Opened):
+            return found
+        first = first or f"cannot be read as a mesh ({name}: {found}); {_WAY_OUT}"
+    return first
 
 
-def _by_meshio(path: Path) -> meshio.Mesh:
-    import meshio
-    from meshio.abaqus import _abaqus
-    from meshio.gmsh import _gmsh41
-
-    for kind, names in _ABAQUS.items():
-        for name in names:
-            _abaqus.abaqus_to_meshio_type.setdefault(name, kind)
-    read_entities = _gmsh41._read_entities
-    _gmsh41._read_entities = lambda *words: _all_in_groups(*read_entities(*words))
+def _tried(read: Reader, path: Path, size: int) -> Opened | str:
+    """Return what a reader makes of a file, or why it makes nothing."""
+    notes: list[str] = []
+    said = io.StringIO()
+    seconds, memory = SECONDS + SECONDS_PER_BYTE * size, MEMORY + MEMORY_PER_BYTE * size
     try:
-        return meshio.read(path)
-    finally:
-        _gmsh41._read_entities = read_entities
+        with warnings.catch_warnings(), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            warnings.simplefilter("ignore")
+            # numpy's word for numbers that it could not read and leaves out
+            warnings.filterwarnings("error", "string or file could not be read to its end")
+            with bounded(seconds, memory):
+                mesh = read(path, notes)
+                _check_arrays(mesh)
+        return Opened(mesh, (*notes, *_lines(said)))
+    except TooLongError:
+        return f"takes longer than {seconds:.0f} s: what it announces cannot be true"
+    except MemoryError:
+        return f"wants more than {memory / 1e9:.1f} GB of memory: what it announces cannot be true"
+    except (Exception, SystemExit) as error:
+        return shown(_reason(error, _lines(said)), 300)
 
 
-def _all_in_groups(physical, bounding):
-    """Return what meshio reads of gmsh's entities; those in no group are in 0, or it loses count of them."""
-    return tuple({tag: groups or [0] for tag, groups in of.items()} for of in physical), bounding
+def _check_arrays(mesh: meshio.Mesh) -> None:
+    """Raise unless points, cells and groups are arrays of the forms that they should have."""
+    from meshio._common import num_nodes_per_cell
+
+    mesh.points = np.asarray(mesh.points, dtype=float)
+    if mesh.points.ndim != 2 or mesh.points.shape[1] not in (1, 2, 3):
+        raise ValueError("points without two or three coordinates each")
+    for block in mesh.cells:
+        if block.type in KINDS and len(block.data):
+            nodes = num_nodes_per_cell.get(block.type, block.data.shape[-1])
+            if block.data.ndim != 2 or block.data.shape[1] != nodes or not np.issubdtype(block.data.dtype, np.integer):
+                raise ValueError(f"cells of type {block.type} that have not {nodes} nodes each")
+            if block.data.min() < 0 or block.data.max() >= len(mesh.points):
+                raise ValueError("cells name points that the file does not hold")
+    lengths = [len(block.data) for block in mesh.cells]
+    for name, sets in mesh.cell_sets.items():
+        for chosen, length in zip(sets, lengths, strict=True):
+            _check_numbers(name, chosen, length)
+    for name, chosen in mesh.point_sets.items():
+        _check_numbers(name, chosen, len(mesh.points))
 
 
-def _by_trimesh(path: Path) -> meshio.Mesh:
-    import meshio
-    import trimesh
+def _check_numbers(name: str, chosen: np.ndarray | None, length: int) -> None:
+    numbers = np.asarray([] if chosen is None else chosen).ravel()
+    if len(numbers) and (numbers.min() < 0 or numbers.max() >= length):
+        raise ValueError(f"group {name!r} has members that the file does not hold")
 
-    surface = trimesh.load_mesh(path, process=False)
-    if not len(surface.faces):  # it reads what is no mesh as one without faces
-        raise ValueError("no faces")
-    return meshio.Mesh(np.asarray(surface.vertices), [("triangle", np.asarray(surface.faces))])
+
+def _reason(error: BaseException, said: list[str]) -> str:
+    """Return why a reader failed."""
+    if isinstance(error, ImportError):
+        return f"reading it takes the Python package {error.name}, which is not there"
+    if isinstance(error, UnicodeDecodeError):
+        return "what should be text is none"
+    if isinstance(error, KeyError):
+        return f"it names {error.args[0]!r}, which it does not hold or which is not known" if error.args else "KeyError"
+    if isinstance(error, FileNotFoundError):
+        return f"it needs {Path(error.filename).name}, which is not beside it" if error.filename else str(error)
+    text = " ".join([" ".join(str(error).split()) * (not isinstance(error, SystemExit)), *said]).strip()
+    return text or "it is not as this format should be"
+
+
+def _lines(said: io.StringIO) -> list[str]:
+    """Return what was printed as one line, if anything."""
+    text = " ".join(said.getvalue().split())
+    return [text] if text else []

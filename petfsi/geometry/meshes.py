@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -17,18 +16,15 @@ from scipy.spatial import cKDTree
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
-from petfsi.geometry.groups import cell_groups
-from petfsi.geometry.mesh_files import open_mesh
-from petfsi.geometry.quadratic import EDGES
+from petfsi.geometry.mesh_cells import read_cells
+from petfsi.geometry.mesh_files import once
 from petfsi.geometry.shapes import inside
-from petfsi.geometry.splitting import KINDS, Kind, simplices
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
-from petfsi.messages import shown
 from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Box, Shape
 
 if TYPE_CHECKING:
-    import meshio
+    pass
 
 #: A cell is degenerate below this fraction of its longest edge to the power dim.
 FLAT = 1e-12
@@ -36,11 +32,8 @@ FLAT = 1e-12
 COINCIDENT = 1e-10
 #: Points of surfaces that are this near are one, as a fraction of the extent: files may hold single precision.
 ROUNDED = 1e-7
-
-#: The simplex of each dimension, as meshio calls it.
-SIMPLEX = {1: "line", 2: "triangle", 3: "tetra"}
-#: Sides count as straight up to this part of their length.
-STRAIGHT = 1e-6
+#: More points than this that near are no rounding.
+CROWD = 100
 
 
 @dataclass(frozen=True)
@@ -130,12 +123,12 @@ def build_mesh(
     InputError
         If there is no such mesh or it is not fit for a computation.
     """
-    shape = solid.shape
+    shape, notes = solid.shape, [] if notes is None else notes
     if shape.mesh is not None:
-        key = f"{key}.shape.mesh"
-        points, cells = read_mesh(shape, dim, key, directory, [] if notes is None else notes)
-        _check(points, cells, f"{key} = {shape.mesh!r}")
-        return points, cells
+        what = ("solid", key, dim, directory, shape.model_dump_json())
+        points, cells, told = once(what, lambda: _read_solid(shape, dim, f"{key}.shape.mesh", directory))
+        notes += told
+        return points.copy(), cells.copy()
     if shape.beam is not None:
         return strip_mesh(shape.beam)
     if shape.ball is not None and shape.ball.cells is not None:
@@ -181,15 +174,17 @@ def box_mesh(box: Box) -> tuple[np.ndarray, np.ndarray]:
     return points, (corner + np.concatenate(tets)).reshape(-1, 4)
 
 
-def read_mesh(shape: Shape, dim: int, key: str, directory: Path, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and positively oriented simplices of a mesh file, scaled and moved. Not collective.
+def _read_solid(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return points and positively oriented simplices of a mesh file, scaled and moved, and what is told of them.
 
     Cells that are no simplices are cut into some, those of second order are taken by their corners, points of no cell
-    are left out; ``notes`` gets a line for each.
+    are left out: each is told.
     """
-    points, cells = _read(shape, dim, dim, key, directory, notes)
-    points, cells = _drop_unused(points, cells)
-    return points, _turned(points, cells, key, notes)
+    notes: list[str] = []
+    points, cells = _drop_unused(*read_cells(shape, dim, dim, key, directory, notes))
+    cells = _turned(points, cells, key, notes)
+    _check(points, cells, f"{key} = {shape.mesh!r}")
+    return points, cells, notes
 
 
 def _turned(points: np.ndarray, cells: np.ndarray, key: str, notes: list[str]) -> np.ndarray:
@@ -220,10 +215,18 @@ def read_surface(
     notes : list of str, optional
         Gets what a user should know of how the file was read.
     """
-    told: list[str] = [] if notes is None else notes
-    points, facets = _read(shape, dim, dim - 1, f"{key}.mesh", directory, told)
-    where = f"{key}.mesh = {shape.mesh!r}"
-    points, facets = _merged(points, facets)
+    what = ("surface", key, dim, directory, shape.model_dump_json())
+    points, facets, told = once(what, lambda: _read_closed(shape, dim, f"{key}.mesh", directory))
+    if notes is not None:
+        notes += told
+    return points.copy(), facets.copy()
+
+
+def _read_closed(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    notes: list[str] = []
+    points, facets = read_cells(shape, dim, dim - 1, key, directory, notes)
+    where = f"{key} = {shape.mesh!r}"
+    points, facets = _merged(*_drop_unused(points, facets), where)
     shared = np.sort(facets, axis=1)
     _refuse(where, np.count_nonzero(np.any(np.diff(shared, axis=1) == 0, axis=1)), "facets without extent")
     _refuse(where, np.count_nonzero(occurrences(facets) > 1), "duplicate facets")
@@ -235,102 +238,22 @@ def read_surface(
     _, count = np.unique(ends, axis=0, return_counts=True)
     _refuse(where, np.count_nonzero(count > 1), "edges at which the facets' orientations disagree")
     volume = np.linalg.det(points[facets] - points.mean(axis=0)).sum()
-    return _drop_unused(points, facets if volume > 0 else facets[:, ::-1])
+    return *_drop_unused(points, facets if volume > 0 else facets[:, ::-1]), notes
 
 
-def _merged(points: np.ndarray, facets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merged(points: np.ndarray, facets: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Return points of which those in one place are one, and the facets with them."""
     points, number = np.unique(points, axis=0, return_inverse=True)
-    close = cKDTree(points).query_pairs(ROUNDED * float(np.ptp(points, axis=0).max()), output_type="ndarray")
+    near = ROUNDED * float(np.ptp(points, axis=0).max())
+    # of points that are all near each other, as beside one that is far away, there are too many pairs to list
+    if near > 0:
+        _, count = np.unique(np.floor((points - points.min(axis=0)) / near), axis=0, return_counts=True)
+        _refuse(where, int(count[count > CROWD].sum()), f"points lie within {near:g} of others: one may be far away")
+    close = cKDTree(points).query_pairs(near, output_type="ndarray")
     graph = coo_matrix((np.ones(len(close)), (close[:, 0], close[:, 1])), shape=(len(points),) * 2)
     _, label = connected_components(graph, directed=False)
     _, first = np.unique(label, return_index=True)
     return points[first], label[number.ravel()][facets]
-
-
-def _read(
-    shape: Shape, dim: int, of: int, key: str, directory: Path, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return points, scaled and moved, and the simplices of all cells of dimension ``of``."""
-    mesh = open_mesh(shape, key, directory)
-    where = f"{key} = {shape.mesh!r}"
-    points = np.asarray(mesh.points, dtype=float)
-    found, unused = [], np.ones(len(points), dtype=bool)
-    for n, kind, nodes in body_blocks(mesh, shape, of, key):
-        if nodes.min() < 0 or nodes.max() >= len(points):
-            raise InputError(f"{where}: cells name points that the file does not hold")
-        unused[nodes] = False
-        found.append(simplices(nodes[:, : kind.corners], of)[0])
-        notes += _taken(points, mesh.cells[n].type, kind, nodes, key, len(found[-1]))
-    for name, count in _others(mesh, of).items():
-        notes.append(f"{key}: {count:,} cells of type {name} are not read")
-    if not found:
-        held = shown(", ".join(sorted({block.type for block in mesh.cells if len(block.data)})), 200)
-        held = held or "no cells at all"
-        raise InputError(f"{where}: holds no {SIMPLEX[of]} cells, which dim = {dim} wants; found {held}")
-    if unused.any() and shape.cells is None:
-        notes.append(f"{key}: {np.count_nonzero(unused):,} points that belong to no cell are left out")
-    points = _as_dim(points, dim, where)
-    return points * shape.scale + np.array(shape.translate or [0.0] * dim), np.concatenate(found)
-
-
-def body_blocks(mesh: meshio.Mesh, shape: Shape, of: int, key: str) -> Iterator[tuple[int, Kind, np.ndarray]]:
-    """Return number, kind and nodes of the blocks of cells that a shape means: those of dimension ``of``, in its group.
-
-    Raises
-    ------
-    InputError
-        If there is no such group.
-    """
-    masks = None
-    if shape.cells is not None:
-        groups = cell_groups(mesh, of)
-        if shape.cells not in groups:
-            known = shown(", ".join(sorted(groups)), 300) or "none at all"
-            where = f"{key.removesuffix('mesh')}cells = {shape.cells!r}"
-            raise InputError(f"{where}: the mesh file has no such group of cells; it has {known}")
-        masks = groups[shape.cells]
-    for n, block in enumerate(mesh.cells):
-        kind = KINDS.get(block.type)
-        if kind is not None and kind.dim == of:
-            nodes = np.asarray(block.data, dtype=np.int64)
-            nodes = nodes if masks is None else nodes[masks[n]]
-            if len(nodes):
-                yield n, kind, nodes
-
-
-def _others(mesh: meshio.Mesh, of: int) -> dict[str, int]:
-    """Return how many cells of which types are neither of dimension ``of`` nor parts of such cells' boundary."""
-    found: dict[str, int] = {}
-    for block in mesh.cells:
-        kind = KINDS.get(block.type)
-        if len(block.data) and (block.type != "vertex" if kind is None else kind.dim > of):
-            found[block.type] = found.get(block.type, 0) + len(block.data)
-    return found
-
-
-def _taken(points: np.ndarray, name: str, kind: Kind, nodes: np.ndarray, key: str, count: int) -> Iterator[str]:
-    """Say what was done with cells of which simplices were made."""
-    if kind.corners != kind.dim + 1:
-        yield f"{key}: {len(nodes):,} cells of type {name} are cut into {count:,} of type {SIMPLEX[kind.dim]}"
-    if kind.order > 1:
-        bent = ""
-        if kind.corners == kind.dim + 1:
-            ends = points[nodes[:, EDGES[kind.dim]]]
-            middles = points[nodes[:, kind.corners : kind.corners + ends.shape[1]]]
-            off = np.linalg.norm(middles - ends.mean(axis=2), axis=-1)
-            if np.any(off > STRAIGHT * np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)):
-                bent = f", up to {off.max():.3g} (in the file's unit) beside the middles of curved ones"
-        yield f"{key}: {len(nodes):,} cells of type {name} are read by their corners: sides are straight{bent}"
-
-
-def _as_dim(points: np.ndarray, dim: int, where: str) -> np.ndarray:
-    _refuse(where, np.count_nonzero(~np.isfinite(points).all(axis=1)), "points with a coordinate that is no number")
-    if points.shape[1] < dim:
-        raise InputError(f"{where}: points have {points.shape[1]} coordinates, dim = {dim} wants {dim}")
-    if points.shape[1] > dim and np.ptp(points[:, dim:], axis=0).max() > 1e-9 * np.ptp(points, axis=0).max():
-        raise InputError(f"{where}: the points do not lie in one plane z = constant, as dim = 2 wants")
-    return np.ascontiguousarray(points[:, :dim])
 
 
 def _drop_unused(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from petfsi.errors import InputError
 from petfsi.geometry.groups import cell_groups, point_groups
+from petfsi.geometry.mesh_cells import body_blocks
 from petfsi.geometry.mesh_files import open_mesh
-from petfsi.geometry.meshes import body_blocks
 from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, simplices
@@ -63,22 +63,22 @@ def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
     if solid.shape.mesh is None or not any(isinstance(where, Tagged) for where in places):
         return {}
     key = f"{key}.shape.mesh"
-    mesh = open_mesh(solid.shape, key, directory)
+    mesh = open_mesh(solid.shape, key, directory).mesh
     corners = {n: nodes[:, : kind.corners] for n, kind, nodes in body_blocks(mesh, solid.shape, dim, key)}
     used = np.unique(np.concatenate([nodes.ravel() for nodes in corners.values()]))
     number = np.full(len(mesh.points), -1)
     number[used] = np.arange(len(used))
     found: Tags = {}
-    for name, masks in cell_groups(mesh, dim - 1).items():
-        facets = np.concatenate([_simplices(mesh, n, number, mask) for n, mask in enumerate(masks) if mask.any()])
+    for name, chosen in cell_groups(mesh, dim - 1).items():
+        facets = np.concatenate([_simplices(mesh, n, number, own) for n, own in enumerate(chosen) if len(own)])
         facets = facets[(facets >= 0).all(axis=1)]
         found[name] = Tag(facets, np.unique(facets))
     for name, points in point_groups(mesh).items():
         nodes = number[points]
         found.setdefault(name, Tag(None, np.unique(nodes[nodes >= 0])))
-    for name, masks in cell_groups(mesh, dim).items():
-        kept = [number[mesh.cells[n].data[mask][:, : KINDS[mesh.cells[n].type].corners]] for n, mask in enumerate(masks)
-                if mask.any()]  # fmt: skip
+    for name, chosen in cell_groups(mesh, dim).items():
+        kept = [number[mesh.cells[n].data[own][:, : KINDS[mesh.cells[n].type].corners]] for n, own in enumerate(chosen)
+                if len(own)]  # fmt: skip
         nodes = np.unique(np.concatenate([part.ravel() for part in kept]))
         found.setdefault(name, Tag(None, nodes[nodes >= 0]))
     return found

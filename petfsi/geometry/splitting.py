@@ -22,7 +22,7 @@ class Kind(NamedTuple):
     corners : int
         They come first.
     order : int
-        2 if it has nodes on its edges, too, and may have some in its middle.
+        2 if it has a node on each of its edges, too, and may have some in its middle; 3 if it has more.
     """
 
     dim: int
@@ -39,8 +39,23 @@ KINDS = {
     "wedge": Kind(3, 6, 1), "wedge15": Kind(3, 6, 2), "wedge18": Kind(3, 6, 2),
     "hexahedron": Kind(3, 8, 1), "hexahedron20": Kind(3, 8, 2), "hexahedron27": Kind(3, 8, 2),
     "line": Kind(1, 2, 1), "line3": Kind(1, 2, 2),
+} | {
+    name + str(nodes): Kind(dim, corners, 3)
+    for name, dim, corners, counts in (
+        ("line", 1, 2, (4, 5, 6, 7)), ("triangle", 2, 3, (10, 15, 21)), ("quad", 2, 4, (16, 25, 36)),
+        ("tetra", 3, 4, (20, 35, 56)), ("wedge", 3, 6, (40, 75)), ("hexahedron", 3, 8, (64, 125, 216)),
+    )
+    for nodes in counts
+} | {
+    f"VTK_LAGRANGE_{name}": Kind(dim, corners, 3)
+    for name, dim, corners in (
+        ("CURVE", 1, 2), ("TRIANGLE", 2, 3), ("QUADRILATERAL", 2, 4), ("TETRAHEDRON", 3, 4), ("HEXAHEDRON", 3, 8),
+        ("WEDGE", 3, 6), ("PYRAMID", 3, 5),
+    )
 }  # fmt: skip
 
+#: The simplex of each dimension.
+SIMPLEX = {1: "line", 2: "triangle", 3: "tetra"}
 #: The faces of cells with so many corners.
 _FACES = {
     5: ((0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from petfsi import __version__
 from petfsi.errors import InputError
+from petfsi.geometry.mesh_files import read_once
 from petfsi.output import checkpoint as checkpoints
 from petfsi.output.lock import held, refuse_if_held
 from petfsi.output.manifest import Change, Leg, OriginMark
@@ -59,14 +60,16 @@ def run_scene(
     on_root(comm, lambda: refuse_if_held(out))
     origin = Origin.find(source, out, comm) if source is not None else None
     meshes = on_root(comm, lambda: mesh_files(scene))
-    simulation, unread, options = made_ready(comm, scene, petsc_args, origin)
+    with read_once():
+        simulation, unread, options = made_ready(comm, scene, petsc_args, origin)
+        begins = on_root(comm, lambda: _begins(simulation))
     text = dump_scene(scene, own_names([mesh.mark for mesh in meshes], out))
     with held(out, comm, make=True) as lock:
         files = RunDirectory.create(out, text, options.dump(), overwrite, comm, meshes)
         leg = _leg(simulation, sets, petsc_args, origin=None if origin is None else origin.mark)
         known = on_root(comm, lambda: files.first_record(meshes, leg))
         with Console(comm.rank, files.log, total=_total(simulation, steps)) as console:
-            _greet(console, simulation, options, unread, files)
+            _greet(console, simulation, options, unread, files, begins)
             run = Run(simulation, files, console, known, lock)
             with run.recorded():
                 run.open()
@@ -101,9 +104,10 @@ def resume_run(
             raise InputError(f"{directory} does not fit its checkpoint {found.path.name}; nothing was changed:{lines}")
         scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
         options = solve.load_options(petsc_args, stored=files.options)
-        simulation = Simulation(comm, scene)
-        # of the scene's start: it would move the fluid's faces to the restored solid
-        unread = simulation.prepare(resumes_at=found.time)
+        with read_once():
+            simulation = Simulation(comm, scene)
+            # of the scene's start: it would move the fluid's faces to the restored solid
+            unread = simulation.prepare(resumes_at=found.time)
         _restore(simulation, found)
         text = dump_scene(scene, own_names(list(known.meshes), directory))
         changes = find_changes(known.settings, text, options.dump())
@@ -172,15 +176,19 @@ def _total(simulation: Simulation, steps: int | None) -> int | None:
     return min(known, default=None)
 
 
-def _greet(console: Console, simulation: Simulation, options: Options, unread: list[str], files: RunDirectory) -> None:
+def _greet(
+    console: Console,
+    simulation: Simulation,
+    options: Options,
+    unread: list[str],
+    files: RunDirectory,
+    begins: tuple[list[str], list[str]] = ([], []),
+) -> None:
     for line in beginning(simulation, options, files):
         console.note(line)
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]
-    warned: list[str] = []
-    if simulation.step == 0:
-        read, warned = on_root(simulation.comm, lambda: _begins(simulation))
-        told.append(read)
-    for note in [*options.notes, *chain.from_iterable(told), *simulation.notes]:
+    read, warned = begins
+    for note in [*options.notes, *chain.from_iterable(told), *read, *simulation.notes]:
         console.note(note)
     for line in warned:
         console.warn(line)

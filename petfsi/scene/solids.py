@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from typing_extensions import Doc
 
 from petfsi.registry import MATERIALS
-from petfsi.scene.tables import Flag, Number, OneOf, Real, Shape, Table, Vector
+from petfsi.scene.tables import Flag, GroupName, Number, OneOf, Real, Shape, Table, Vector
 
 Component = Literal["x", "y", "z", "angle"]
 Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
@@ -27,8 +27,8 @@ class Tagged(Table):
     """A group of boundary facets or of nodes that a mesh file has a name (or a number) for."""
 
     tag: Annotated[
-        str,
-        Field(min_length=1, description="the name of a group of facets or nodes in the mesh file"),
+        GroupName,
+        Field(description="the name of a group of facets or nodes in the mesh file"),
         Doc("The name, or number, of the group. Of facets, else of nodes, else of cells, whose corners it means."),
     ]
 

@@ -29,6 +29,11 @@ def either(names: Iterable[object]) -> str:
     return " or ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
 
 
+def _name_of_number(value: Any) -> Any:
+    """Return the name that a whole number stands for."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 10**18 else value
+
+
 @dataclass(frozen=True)
 class OneOf:
     """A validator of names that are registered elsewhere, which speaks as those of literals do."""
@@ -51,6 +56,8 @@ Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 Vector = list[Real]
 Cells = list[Annotated[Whole, Field(ge=1)]]
+#: The name of a group in a mesh file, or its number.
+GroupName = Annotated[str, Field(min_length=1), BeforeValidator(_name_of_number)]
 #: A number, or an expression of x, y, z, t and pi (see ``expressions.py``).
 Number = Annotated[float | str, BeforeValidator(_number_or_text)]
 
@@ -142,15 +149,12 @@ class Shape(Table):
     beam: Annotated[Beam | None, Doc("One of the shapes: a beam, of solids in 2D.")] = None
     mesh: Annotated[
         str | None,
-        Field(description="a file that meshio reads"),
-        Doc(
-            "One of the shapes: a mesh file. Its path is relative to the scene's folder; surfaces that meshio cannot "
-            "read are read by trimesh."
-        ),
+        Field(description="a mesh file"),
+        Doc("One of the shapes: a mesh file. Its path is relative to the scene's folder; README says what is read."),
     ] = None
     cells: Annotated[
-        str | None,
-        Field(min_length=1, description="which group of a mesh file's cells"),
+        GroupName | None,
+        Field(description="which group of a mesh file's cells"),
         Doc("The name, or number, of the mesh file's group of cells that is the body. Left out, all cells are."),
     ] = None
     scale: Annotated[

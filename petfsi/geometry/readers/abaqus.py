@@ -1,0 +1,178 @@
+"""Nodes, elements and sets of Abaqus's and CalculiX's input files.
+
+meshio knows some types of elements, and takes no blank fields, no sets that are generated and no names in another case.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+#: Families of elements, what they are for is none of a mesh's business: their cells by the number of nodes.
+_FAMILIES = (
+    (
+        re.compile(r"(?:C3D|DC3D|DCC3D|F3D|AC3D|EC3D|Q3D|SC|CSS)(\d+)"),
+        {4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15",
+         20: "hexahedron20", 27: "hexahedron27"},
+    ),
+    (
+        re.compile(r"(?:CPS|CPE|CPEG|DC2D|DCC2D|AC2D|F2D|CAX|CGAX|DCAX|M3D|SFM3D|R3D|US|DS|S|STRI)(\d)"),
+        {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"},
+    ),
+    (re.compile(r"[TR][23]D(\d)"), {2: "line", 3: "line3"}),
+    (re.compile(r"(?:B|PIPE)[23](\d)"), {1: "line", 2: "line3", 3: "line"}),
+)  # fmt: skip
+_NODES = {
+    "line": 2, "line3": 3, "triangle": 3, "triangle6": 6, "quad": 4, "quad8": 8, "quad9": 9, "tetra": 4, "tetra10": 10,
+    "pyramid": 5, "pyramid13": 13, "wedge": 6, "wedge15": 15, "hexahedron": 8, "hexahedron20": 20, "hexahedron27": 27,
+}  # fmt: skip
+#: Cards that make or move nodes and elements.
+_MAKERS = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETRIC MODEL GENERATION")
+#: How deep files include others.
+DEPTH = 5
+
+Card = tuple[str, dict[str, str], list[str]]
+
+
+class _Sets:
+    """Sets of numbers by name; a set may hold others, and names have no case."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, list[np.ndarray | str]] = {}
+        self._names: dict[str, str] = {}
+
+    def add(self, name: str, found: list[np.ndarray | str]) -> None:
+        self._names.setdefault(name.upper(), name)
+        self._found.setdefault(name.upper(), []).extend(found)
+
+    def all(self) -> dict[str, np.ndarray]:
+        """Return the numbers of each set."""
+        return {name: self._numbers(key, ()) for key, name in self._names.items()}
+
+    def _numbers(self, key: str, above: tuple[str, ...]) -> np.ndarray:
+        if key in above or len(above) > 20:
+            return np.zeros(0, dtype=np.int64)
+        parts = [self._numbers(part, (*above, key)) if isinstance(part, str) else part
+                 for part in self._found.get(key, [])]  # fmt: skip
+        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *parts]))
+
+
+def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return a mesh with its sets of nodes and elements; what is no cell is told."""
+    points: list[tuple[np.ndarray, np.ndarray]] = []
+    cells: list[tuple[str, np.ndarray, np.ndarray]] = []
+    node_sets, element_sets = _Sets(), _Sets()
+    others: dict[str, int] = {}
+    instances = 0
+    for word, given, lines in _cards(path, 0):
+        if word == "NODE":
+            if given.get("SYSTEM", "R").upper() != "R":
+                raise meshio.ReadError("nodes in coordinates that are not rectangular (*NODE, SYSTEM)")
+            points.append(_nodes(lines))
+            if "NSET" in given:
+                node_sets.add(given["NSET"], [points[-1][0]])
+        elif word == "ELEMENT":
+            kind = _kind(given.get("TYPE", ""))
+            if kind is None:
+                name = given.get("TYPE", "?").upper()
+                others[name] = others.get(name, 0) + len(lines)
+                continue
+            rows = _elements(lines, given["TYPE"], _NODES[kind])
+            cells.append((kind, rows[:, 0], rows[:, 1:]))
+            if "ELSET" in given:
+                element_sets.add(given["ELSET"], [rows[:, 0]])
+        elif word in ("NSET", "ELSET") and word in given:
+            (node_sets if word == "NSET" else element_sets).add(given[word], list(_members(lines, "GENERATE" in given)))
+        elif word in _MAKERS:
+            raise meshio.ReadError(f"*{word}: nodes and elements must be written out, in one frame")
+        elif word == "INSTANCE":
+            instances += 1
+            if instances > 1 or any(line.strip(", ") for line in lines):
+                raise meshio.ReadError("parts that are moved or there more than once (*INSTANCE): flatten the model")
+    notes += [f"{count:,} lines of elements of type {name} are not read" for name, count in others.items()]
+    if not points:
+        raise meshio.ReadError("no *NODE")
+    return _joined(points, cells, node_sets.all(), element_sets.all())
+
+
+def _joined(
+    points: list[tuple[np.ndarray, np.ndarray]],
+    cells: list[tuple[str, np.ndarray, np.ndarray]],
+    node_sets: dict[str, np.ndarray],
+    element_sets: dict[str, np.ndarray],
+) -> meshio.Mesh:
+    """Return the mesh: nodes by where they stand; of a node that is given twice the last."""
+    tags, first = np.unique(np.concatenate([numbers for numbers, _ in points])[::-1], return_index=True)
+    where = np.concatenate([x for _, x in points])[::-1][first]
+    blocks = []
+    for kind, _, nodes in cells:
+        place = np.minimum(np.searchsorted(tags, nodes), len(tags) - 1)
+        if np.any(tags[place] != nodes):
+            raise meshio.ReadError("elements name nodes that the file does not hold")
+        blocks.append(meshio.CellBlock(kind, place))
+    sets = {name: [np.flatnonzero(np.isin(numbers, chosen)) for _, numbers, _ in cells]
+            for name, chosen in element_sets.items()}  # fmt: skip
+    of = {name: np.flatnonzero(np.isin(tags, chosen)) for name, chosen in node_sets.items()}
+    return meshio.Mesh(where, blocks, cell_sets=sets, point_sets=of)
+
+
+def _cards(path: Path, depth: int) -> Iterator[Card]:
+    """Yield the cards of a file and of those that it includes: word, what is given with it, lines of data."""
+    lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and line[:2] != "**"]
+    starts = [n for n, line in enumerate(lines) if line.lstrip()[:1] == "*"]
+    for begin, end in itertools.pairwise([*starts, len(lines)]):
+        head = lines[begin].strip()
+        while head.endswith(",") and begin + 1 < end:
+            begin += 1
+            head += lines[begin].strip()
+        word, *words = (part.strip() for part in head[1:].split(","))
+        given = {key.strip().upper(): value.strip().strip('"') for key, _, value in (w.partition("=") for w in words)}
+        if word.upper() != "INCLUDE":
+            yield " ".join(word.upper().split()), given, lines[begin + 1 : end]
+            continue
+        name = given.get("INPUT", "")
+        if depth == DEPTH or Path(name).name != name:
+            raise meshio.ReadError(f"*INCLUDE of {name}: at most {DEPTH} files deep, and beside the file")
+        yield from _cards(path.with_name(name), depth + 1)
+
+
+def _kind(name: str) -> str | None:
+    for pattern, kinds in _FAMILIES:
+        found = pattern.match(name.upper())
+        if found:
+            return kinds.get(int(found[1]))
+    return None
+
+
+def _nodes(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of nodes and where they are: fields that are blank or not there are 0."""
+    rows = [
+        [field.strip() or "0" for field in (line + ",,,").upper().replace("D", "E").split(",")[:4]] for line in lines
+    ]
+    table = np.array(rows, dtype=float).reshape(-1, 4)
+    return table[:, 0].astype(np.int64), table[:, 1:]
+
+
+def _elements(lines: list[str], name: str, nodes: int) -> np.ndarray:
+    """Return number and nodes of each element, which may go over several lines."""
+    numbers = np.array([field for field in ",".join(lines).split(",") if field.strip()], dtype=np.int64)
+    if len(numbers) % (nodes + 1):
+        raise meshio.ReadError(f"elements of type {name} do not have {nodes} nodes each")
+    return numbers.reshape(-1, nodes + 1)
+
+
+def _members(lines: list[str], generated: bool) -> Iterator[np.ndarray | str]:
+    """Yield numbers and names of other sets."""
+    if generated:
+        for line in lines:
+            first, last, step = ([int(field) for field in line.split(",") if field.strip()] + [1])[:3]
+            yield np.arange(first, last + 1, max(step, 1))
+        return
+    fields = [field.strip() for field in ",".join(lines).split(",") if field.strip()]
+    yield np.array([field for field in fields if field.isdigit()], dtype=np.int64)
+    yield from (field.strip('"').upper() for field in fields if not field.isdigit())

@@ -1,0 +1,187 @@
+"""Which reader takes a mesh file: what its beginning says first, then its ending."""
+
+from __future__ import annotations
+
+import io
+import re
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import meshio
+import numpy as np
+from meshio._helpers import reader_map
+from meshio._mesh import topological_dimension
+
+from petfsi.geometry.readers.abaqus import read_abaqus
+from petfsi.geometry.readers.exodus import read_exodus
+from petfsi.geometry.readers.gmsh import read_gmsh
+
+#: Takes a file and a list of what its user should know of how it was read.
+Reader = Callable[[Path, list[str]], meshio.Mesh]
+
+#: What a file's beginning is looked at, bytes.
+HEAD = 4096
+#: Formats by how files begin, whatever they are called.
+_BEGINNINGS = tuple(
+    (re.compile(pattern, re.IGNORECASE), name)
+    for pattern, name in (
+        (rb"\$(MeshFormat|NOD|Comments)\b", "gmsh"),
+        (rb"(<\?xml[^>]*>)?\s*<VTKFile[^>]*UnstructuredGrid", "vtu"),
+        (rb"# vtk DataFile", "vtk"),
+        (rb"MeshVersionFormatted", "medit"),
+        (rb"MFEM ", "MFEM"),
+        (rb"(\*\*[^\n]*\n|\s)*\*[a-z]", "abaqus"),
+        (rb"(#[^\n]*\n|\s)*\d+ +\d+ +\d+ +\d+ +\d+\s*\n", "avsucd"),
+        (rb"\d+ +\d+ +\d+ *\r?\n *[-+.\de]+ +[-+.\de]+ +\d+ *\r?\n", "freefem"),
+        (rb"\(", "ansys"),
+    )
+)
+#: Formats by endings, where meshio has none, or one that the beginning should have told.
+_ENDINGS = {".ucd": "avsucd", ".exii": "exodus", ".g": "exodus", ".inp": "inp", ".msh": "msh"}
+#: What is not read, and why.
+_REFUSED = {
+    "MFEM": "meshes of MFEM are not read",
+    "mdpa": "meshes of Kratos are not read: they name elements, not their cells",
+    "svg": "pictures are not read",
+    "inp": "it begins neither as Abaqus's files do nor as AVS's",
+    "msh": "it begins as files of neither Gmsh, nor ANSYS, Abaqus or FreeFem do",
+}
+#: Formats of surfaces that trimesh reads, too.
+_SURFACES = ("obj", "off", "ply", "stl")
+
+
+# meshio and the readers here know such cells, but it has no dimension for them
+topological_dimension.update(wedge15=3, pyramid13=3)
+
+
+def find_readers(path: Path) -> list[tuple[str, Reader]]:
+    """Return what can read a file, the first first, each with the format that it takes the file for."""
+    with path.open("rb") as file:
+        head = file.read(HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
+    name = next((name for pattern, name in _BEGINNINGS if pattern.match(head)), "") or _by_ending(path)
+    found: list[tuple[str, Reader]] = []
+    if name in _OWN:
+        found.append((name, _OWN[name]))
+    elif name and name not in _REFUSED:
+        found.append((name, partial(_by_meshio, name)))
+    elif name:
+        found.append((name, partial(_not_read, _REFUSED[name])))
+    if name in _SURFACES:
+        found.append((name, _by_trimesh))
+    return found
+
+
+def endings() -> list[str]:
+    """Return the endings of files that are read."""
+    known = {ending for ending, names in meshio.extension_to_filetypes.items() if set(names) - set(_REFUSED)}
+    return sorted(known | set(_ENDINGS))
+
+
+def _by_ending(path: Path) -> str:
+    ending = path.suffix.lower()
+    return _ENDINGS.get(ending) or next(iter(meshio.extension_to_filetypes.get(ending, [])), "")
+
+
+def _not_read(why: str, path: Path, notes: list[str]) -> meshio.Mesh:
+    raise meshio.ReadError(why)
+
+
+def _by_meshio(name: str, path: Path, notes: list[str]) -> meshio.Mesh:
+    mesh = reader_map[name](str(path))
+    if name in _SURFACES and any(block.type == "polygon" for block in mesh.cells):
+        raise meshio.ReadError("faces of more than four corners")
+    if name in _SURFACES and mesh.points.ndim == 2:
+        mesh.points = mesh.points[:, :3]  # colours may follow
+    return mesh
+
+
+def _by_trimesh(path: Path, notes: list[str]) -> meshio.Mesh:
+    import trimesh
+
+    surface = trimesh.load_mesh(path, process=False)
+    if not len(surface.faces):  # it reads what is no mesh as one without faces
+        raise meshio.ReadError("no faces")
+    return meshio.Mesh(np.asarray(surface.vertices), [("triangle", np.asarray(surface.faces))])
+
+
+def _of_text(text: str, name: str) -> meshio.Mesh:
+    """Return what meshio makes of a text; its readers lose their place where lines end as on Windows."""
+    with tempfile.TemporaryDirectory() as directory:
+        copy = Path(directory, f"mesh.{name}")
+        copy.write_text(text, newline="\n")
+        return reader_map[name](str(copy))
+
+
+def _read_vtk(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return what meshio reads; where it does not know what results are of, the mesh without them."""
+    try:
+        return reader_map["vtk"](str(path))
+    except (Exception, SystemExit):
+        data = path.read_bytes()
+        end = re.search(rb"\n(CELL|POINT)_DATA\b", data)
+        if end is None:
+            raise
+        with tempfile.TemporaryDirectory() as directory:
+            copy = Path(directory, "mesh.vtk")
+            copy.write_bytes(data[: end.start() + 1])
+            mesh = reader_map["vtk"](str(copy))
+        notes.append("values at cells and points cannot be read, and so no groups")
+        return mesh
+
+
+def _read_stl(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return the facets of a text, however its solids begin and end, or what meshio makes of binary files."""
+    data = path.read_bytes()
+    if b"\0" in data[:HEAD] or b"facet" not in data[:HEAD].lower():
+        return reader_map["stl"](str(path))
+    points = np.array(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.IGNORECASE), dtype=float)
+    if not len(points) or len(points) % 3:
+        raise meshio.ReadError("facets that have not three vertices")
+    return meshio.Mesh(points, [("triangle", np.arange(len(points)).reshape(-1, 3))])
+
+
+def _read_nastran(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return what meshio reads of bulk data, whose first and last lines may be missing."""
+    lines = path.read_text(errors="replace").splitlines()
+    bulk = next((n for n, line in enumerate(lines) if line.strip().upper().startswith("BEGIN BULK")), -1)
+    text = "\n".join(["BEGIN BULK", *lines[bulk + 1 :], "ENDDATA", ""])
+    mesh = reader_map["nastran"](io.StringIO(text))
+    if np.any(mesh.point_data.get("nastran:ref", 0)):
+        raise meshio.ReadError("points in coordinates of their own (GRID with CP)")
+    return mesh
+
+
+def _read_su2(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return what meshio reads, with the names of markers instead of numbers."""
+    text = path.read_text(errors="replace")
+    if len(re.findall(r"^\s*NDIME\s*=", text, re.MULTILINE)) > 1:
+        raise meshio.ReadError("more than one zone")
+    mesh = _of_text(text, "su2")
+    number = 0
+    mesh.cell_tags = {}
+    for name in re.findall(r"^\s*MARKER_TAG\s*=\s*(\S+)", text, re.MULTILINE):
+        number = int(name) if re.fullmatch(r"-?\d+", name) else number + 1
+        mesh.cell_tags.setdefault(number, []).append(name)
+    return mesh
+
+
+def _read_freefem(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return triangles, edges and their labels of FreeFem's files in the plane."""
+    numbers = np.fromstring(path.read_bytes(), sep=" ")
+    points, triangles, edges = numbers[:3].astype(int).tolist()
+    ends = np.cumsum([3, 3 * points, 4 * triangles, 3 * edges])
+    if ends[-1] != len(numbers):
+        raise meshio.ReadError("another number of points, triangles or edges than it announces")
+    x, cells, facets = (
+        part.reshape(-1, width) for part, width in zip(np.split(numbers, ends)[1:4], (3, 4, 3), strict=True)
+    )
+    blocks = [("triangle", cells[:, :3].astype(int) - 1), ("line", facets[:, :2].astype(int) - 1)]
+    return meshio.Mesh(x[:, :2], blocks, cell_data={"label": [cells[:, 3].astype(int), facets[:, 2].astype(int)]})
+
+
+_OWN: dict[str, Reader] = {
+    "gmsh": read_gmsh, "abaqus": read_abaqus, "exodus": read_exodus, "nastran": _read_nastran, "su2": _read_su2,
+    "freefem": _read_freefem, "vtk": _read_vtk, "stl": _read_stl,
+}  # fmt: skip
