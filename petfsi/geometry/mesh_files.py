@@ -124,9 +124,9 @@ def _tried(read: Reader, path: Path, size: int) -> Opened | str:
                 _check_arrays(mesh)
         return Opened(mesh, (*notes, *_lines(said)))
     except TooLongError:
-        return f"takes longer than {seconds:.0f} s: what it announces cannot be true"
+        return f"takes longer than {seconds:.0f} s: it is broken, or far too slow to read"
     except MemoryError:
-        return f"wants more than {memory / 1e9:.1f} GB of memory: what it announces cannot be true"
+        return f"wants more than {memory / 1e9:.1f} GB of memory: it is broken, or holds far more than it shows"
     except (Exception, SystemExit) as error:
         return shown(_reason(error, _lines(said)), 300)
 
@@ -165,8 +165,10 @@ def _reason(error: BaseException, said: list[str]) -> str:
         return f"reading it takes the Python package {error.name}, which is not there"
     if isinstance(error, UnicodeDecodeError):
         return "what should be text is none"
-    if isinstance(error, KeyError):
-        return f"it names {error.args[0]!r}, which it does not hold or which is not known" if error.args else "KeyError"
+    if isinstance(error, DeprecationWarning):
+        return "what should be numbers is none"
+    if isinstance(error, KeyError) and error.args and " " not in str(error.args[0]):
+        return f"it names {error.args[0]!r}, which it does not hold or which is not known"
     if isinstance(error, FileNotFoundError):
         return f"it needs {Path(error.filename).name}, which is not beside it" if error.filename else str(error)
     text = " ".join([" ".join(str(error).split()) * (not isinstance(error, SystemExit)), *said]).strip()

@@ -125,7 +125,7 @@ def build_mesh(
     """
     shape, notes = solid.shape, [] if notes is None else notes
     if shape.mesh is not None:
-        what = ("solid", key, dim, directory, shape.model_dump_json())
+        what = ("solid", key, dim, directory, repr(shape))
         points, cells, told = once(what, lambda: _read_solid(shape, dim, f"{key}.shape.mesh", directory))
         notes += told
         return points.copy(), cells.copy()
@@ -215,7 +215,7 @@ def read_surface(
     notes : list of str, optional
         Gets what a user should know of how the file was read.
     """
-    what = ("surface", key, dim, directory, shape.model_dump_json())
+    what = ("surface", key, dim, directory, repr(shape))
     points, facets, told = once(what, lambda: _read_closed(shape, dim, f"{key}.mesh", directory))
     if notes is not None:
         notes += told
