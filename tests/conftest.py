@@ -1,5 +1,6 @@
 """What every test shares: one thread per rank, and of the parallel tests those for the present number of ranks."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -73,6 +74,13 @@ def pytest_runtest_protocol(item):
     """Let nothing of a test, fixtures of its module included, reach the next one."""
     with nothing_left():
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def let_go():
+    """Let go of what a module's tests have made: simulations are in circles, and PETSc's share of them is large."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture
