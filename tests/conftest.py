@@ -83,6 +83,16 @@ def let_go():
     gc.collect()
 
 
+@pytest.fixture(autouse=True)
+def freed():
+    """Free what a test has let go of: PETSc notes it, and waits for all ranks of a communicator to ask for that."""
+    yield
+    petsc = sys.modules.get("petsc4py.PETSc")
+    if petsc is not None and petsc.Sys.isInitialized():
+        for comm in (petsc.COMM_SELF, petsc.COMM_WORLD):
+            petsc.garbage_cleanup(comm)
+
+
 @pytest.fixture
 def here(capfd):
     """Return a function that runs a command in this process."""
