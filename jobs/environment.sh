@@ -3,8 +3,6 @@ export OMP_NUM_THREADS=1 H5PY_ALWAYS_USE_MPI=1
 if [ "$(id -u)" = 0 ]; then
     export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
 fi
-# A process that no mpirun has started wants no daemon beside it: two tenths of a second less for every command.
-export OMPI_MCA_ess_singleton_isolated=1
 # mpirun that is told to end (Ctrl-C, SIGTERM, SIGHUP) tells its ranks after so many seconds and kills them after twice
 # as many; by default after one and two, which is too soon for a step that takes longer to end in a checkpoint. It waits
 # as long after any exit code but 0, too: a person at a terminal has better things to do.
