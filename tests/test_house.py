@@ -27,18 +27,6 @@ class BackwardEuler(Integrator):
     def factor(self, h, past_dt):
         return h
 
-    def moment(self, h):
-        return h
-
-    def instants(self, h):
-        return (h,)
-
-    def stride(self, stage, h):
-        return stage.k
-
-    def solved(self, motion):
-        return motion.velocity
-
     def stage(self, motion, h):
         d = motion.displacement
         return Stage(a=1 / h, k=h, inertia=motion.velocity / h, tangent_at=d, shift=np.zeros_like(d))

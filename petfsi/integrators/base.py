@@ -103,28 +103,30 @@ class Integrator(ABC):
         """Return 1/a, s: an acceleration acts so long on w, and the pressure's gradient on the fluid's velocity."""
 
     @abstractmethod
-    def moment(self, h: float) -> float:
-        """Return how long after the step's begin its equations hold, s."""
-
-    @abstractmethod
-    def instants(self, h: float) -> tuple[float, ...]:
-        """Return the times after the step's begin (s) over which w of a prescribed velocity is the mean."""
-
-    @abstractmethod
-    def stride(self, stage: Stage, h: float) -> float:
-        """Return how far w moves the nodes until the end of the step, s: k where w holds at the end."""
-
-    @abstractmethod
-    def solved(self, motion: Motion) -> np.ndarray:
-        """Return w of the last step; before the first the velocity."""
-
-    @abstractmethod
     def stage(self, motion: Motion, h: float) -> Stage:
         """Return the equation of the coming step."""
 
     @abstractmethod
     def finish(self, motion: Motion, stage: Stage, w: np.ndarray, h: float) -> Motion:
         """Return the motion at the end of the step from the solution of its equation."""
+
+    # of a scheme whose w is the velocity at the end of the step, where its equations hold
+
+    def moment(self, h: float) -> float:
+        """Return how long after the step's begin its equations hold, s."""
+        return h
+
+    def instants(self, h: float) -> tuple[float, ...]:
+        """Return the times after the step's begin (s) over which w of a prescribed velocity is the mean."""
+        return (h,)
+
+    def stride(self, stage: Stage, h: float) -> float:
+        """Return how far w moves the nodes until the end of the step, s: k where w holds at the end."""
+        return stage.k
+
+    def solved(self, motion: Motion) -> np.ndarray:
+        """Return w of the last step; before the first the velocity."""
+        return motion.velocity
 
     def turned(self, motion: Motion, h: float, turns: Turns) -> np.ndarray | None:
         """Return what turning adds to the first components of the d~ of ``stage``, m; None is nothing.

@@ -39,22 +39,6 @@ class Bdf2(Integrator):
         r = h / past_dt
         return (1 + r) ** 2 / (1 + 2 * r), r**2 / (1 + 2 * r)
 
-    def moment(self, h: float) -> float:
-        """Return h: the end of the step."""
-        return h
-
-    def instants(self, h: float) -> tuple[float, ...]:
-        """Return the end of the step."""
-        return (h,)
-
-    def stride(self, stage: Stage, h: float) -> float:
-        """Return k."""
-        return stage.k
-
-    def solved(self, motion: Motion) -> np.ndarray:
-        """Return u^n."""
-        return motion.velocity
-
     def stage(self, motion: Motion, h: float) -> Stage:
         """Return the equation at the end of the step."""
         d, u = motion.displacement, motion.velocity

@@ -33,22 +33,6 @@ class Newmark(Integrator):
         """Return h."""
         return h
 
-    def moment(self, h: float) -> float:
-        """Return h: the end of the step."""
-        return h
-
-    def instants(self, h: float) -> tuple[float, ...]:
-        """Return the end of the step."""
-        return (h,)
-
-    def stride(self, stage: Stage, h: float) -> float:
-        """Return k."""
-        return stage.k
-
-    def solved(self, motion: Motion) -> np.ndarray:
-        """Return u^n."""
-        return motion.velocity
-
     def stage(self, motion: Motion, h: float) -> Stage:
         """Return eq. 18."""
         d, u = motion.displacement, motion.velocity

@@ -25,10 +25,6 @@ class Static(Integrator):
         """Return infinity: nothing resists being accelerated."""
         return np.inf
 
-    def moment(self, h: float) -> float:
-        """Return h: the end of the step."""
-        return h
-
     def instants(self, h: float) -> tuple[float, ...]:
         """Return both ends: the mean brings a prescribed node to within the trapezoidal rule of its place."""
         return (0.0, h)

@@ -43,10 +43,6 @@ class SymplecticEuler(Integrator):
         """Return h."""
         return h
 
-    def solved(self, motion: Motion) -> np.ndarray:
-        """Return u^n."""
-        return motion.velocity
-
     def stage(self, motion: Motion, h: float) -> Stage:
         """Return the equation without damping, which who knows a1 adds by ``shift`` = a1 u^n."""
         u = motion.velocity
