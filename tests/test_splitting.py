@@ -1,6 +1,7 @@
 """Time splitting, in PETSc options alone: it grows and decays as linear theory says, and iterated it is monolithic."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from petfsi.bench import theory
 from petfsi.bench.case import ITERATED, MONOLITHIC, SPLIT, history
 from petfsi.bench.splitting import DT, Layer, growth_of_own_matrices, measure_growth
 from petfsi.errors import FinalError, SolveError
+from petfsi.scene.schema import Scene
+from petfsi.solving.splitting import SplitWatch
 
 COMM = MPI.COMM_SELF
 CELLS = 64
@@ -104,6 +107,69 @@ def test_an_unstable_splitting_is_named_before_it_turns_anything_inside_out(name
 @pytest.mark.parametrize("name", STABLE.values(), ids=STABLE)
 def test_a_stable_splitting_is_left_alone(name):
     assert until_it_fails(name, 12, *SPLITS) == (12, None)
+
+
+class Left:
+    """Equations of which so much is left over; a system as far as the watch looks."""
+
+    comm = COMM
+
+    def __init__(self, left, size):
+        self.residual, self.rhs = (SimpleNamespace(array_r=np.array([value, 0.0])) for value in (left, size))
+
+    def piece(self, name):
+        return slice(None)
+
+
+def steps_watched(lefts, size=1e-9):
+    """Return after how many steps the watch stops, None if it does not, and what it says."""
+    watch = SplitWatch(stops=True)
+    for n, left in enumerate(lefts):
+        try:
+            watch.judge(Left(left, size))
+        except FinalError as error:
+            return n, str(error)
+    return None, watch.story()
+
+
+@pytest.mark.parametrize("power", [1, 2, 3, 4, 6, 9])
+@pytest.mark.parametrize("dt", [1e-4, 1.0])
+def test_a_load_that_sets_in_smoothly_is_no_instability(power, dt):
+    times = dt * np.arange(61.0)
+    assert steps_watched(np.diff(times**power), size=0.0)[0] is None
+
+
+@pytest.mark.parametrize("factor", [1.6, 2.0, 10.0])
+def test_what_grows_by_the_same_factor_is_stopped_and_says_from_where(factor):
+    n, said = steps_watched(factor ** np.arange(9.0))
+    assert n == 3 and f"has risen from 1.0e+00 to {factor**3:.1e} in 3 steps" in said
+
+
+@pytest.mark.parametrize(
+    ("lefts", "size"),
+    [(1.4 ** np.arange(99), 0.0), (2.0 ** np.arange(99), 2.0**99), (np.zeros(9), 0.0), ([0, 1, 2, 0, 1, 2, 4], 0.0)],
+    ids=["slow", "below the load", "nothing", "twice"],
+)
+def test_what_grows_slowly_or_by_less_than_its_load_goes_on(lefts, size):
+    assert steps_watched(lefts, size)[0] is None
+
+
+def test_a_rise_beyond_all_numbers_is_still_one():
+    assert steps_watched([1e-160, 1e150, 1e150, 1e153])[0] is None
+
+
+@pytest.mark.parametrize("power", [2, 3, 4])
+def test_a_body_in_a_stream_that_sets_in_smoothly_goes_on(power):
+    fluid = {
+        "origin": [0.0, 0.0], "size": [2.0, 1.0], "cells": [20, 10], "density": 1000.0,
+        "sides": {"left": {"pressure": f"1e6*t**{power}"}, "right": "open"},
+    }  # fmt: skip
+    box = {"origin": [0.8, 0.3], "size": [0.4, 0.4], "cells": [4, 4]}
+    body = {"shape": {"box": box}, "density": 5e4, "young": 1e8, "poisson": 0.3}
+    made = {"dim": 2, "time": {"end": 0.2, "dt": 0.01}, "fluid": fluid, "solids": {"body": body}}
+    with prepared(Scene.model_validate(made), *SPLITS, comm=COMM) as sim:
+        for _ in range(20):
+            sim.advance()
 
 
 @pytest.mark.parallel([1, 2])
