@@ -268,6 +268,61 @@ def test_periods_of_slender_solids_are_those_of_euler_and_bernoulli(solid, lengt
     assert bending_period(solid, form, span) == pytest.approx(euler_bernoulli(solid, length, c), rel=0.03)
 
 
+ALL = ["x", "y", "z"]
+PLATES = {
+    "as wide as long": ((0.05, 1.0, 1.0), (1, 5, 5), ["bottom"], (1.0, ("clamped", "free"))),
+    "wider than long": ((0.05, 1.0, 2.0), (1, 10, 4), ["bottom"], (1.0, ("clamped", "free"))),
+    "longer than wide": ((0.05, 1.0, 0.4), (1, 10, 4), ["bottom"], (1.0, ("clamped", "free"))),
+    "between two walls": ((0.05, 1.0, 1.5), (1, 5, 5), ["bottom", "top"], (1.0, ("clamped", "clamped"))),
+    "one side of it": ((0.05, 1.0, 1.5), (1, 5, 5), ["front"], (1.5, ("clamped", "free"))),
+    "all round": ((0.05, 1.0, 1.0), (1, 5, 5), ["bottom", "top", "front", "back"], None),
+    "free": ((0.05, 1.0, 1.5), (1, 5, 5), [], (1.5, ("free", "free"))),
+}
+
+
+@pytest.mark.parametrize(("size", "cells", "where", "right"), PLATES.values(), ids=PLATES)
+def test_plates_bend_along_the_side_that_is_free_to(size, cells, where, right):
+    solid = scene(bar(cells, size, [{"where": w, "fix": ALL} for w in where]), dim=3).solids["b"]
+    form = form_of(solid, 3, None)
+    span = widest_span(form, held(solid, form, Path()))
+    assert right == (span and (pytest.approx(span.length), span.ends))
+
+
+def test_a_wide_flap_is_warned_of_as_a_narrow_one_is():
+    for width in (0.4, 1.0, 3.0):
+        made = scene(bar((1, 10, 4), (0.05, 1.0, width), [{"where": "bottom", "fix": ALL}]), dim=3, dt=0.2)
+        said = "".join(warned(made))
+        assert "linear elements, 1 across it" in said and "its slowest bending takes about 3.9 s" in said
+
+
+X = {"where": "left", "fix": ["x"]}
+GUIDED = {
+    "a plane of symmetry": bar(**SLENDER, supports=[X, ROLLER]),
+    "two of them": bar(**SLENDER, supports=[X, X | {"where": "right"}]),
+    "a beam": beam([{"where": "start", "fix": ["angle"]}, {"where": "end", "fix": ["x", "y"]}]),
+}
+
+
+@pytest.mark.parametrize("solid", GUIDED.values(), ids=GUIDED)
+def test_of_ends_that_slide_but_do_not_turn_nothing_is_said(solid):
+    solid = scene(solid).solids["b"]
+    form = form_of(solid, 2, None)
+    assert widest_span(form, held(solid, form, Path())) is None
+
+
+def test_an_inflow_that_swings_is_seen_wherever_it_is_nothing_at_equal_times():
+    for end in (1.0, 8.0, 16.0):
+        inflow = {"inflow": {"speed": "50*sin(4*pi*t)"}}
+        made = scene(None, water(sides={"left": inflow, "right": "open"}), time={"end": end})
+        assert "CFL: 5 cells a step" in "".join(warned(made))
+
+
+def test_a_narrow_inflow_is_seen():
+    inflow = {"inflow": {"speed": "50*exp(-((y - 0.77)/0.02)**2)"}}
+    said = "".join(warned(scene(None, water(sides={"left": inflow, "right": "open"}))))
+    assert float(said.split("CFL: ")[1].split()[0]) == pytest.approx(5.0, rel=0.05)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.7])
 def test_a_bar_from_a_file_is_a_bar_wherever_it_lies(tmp_path, angle):
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 51), np.linspace(0, 0.04, 3), indexing="ij"))

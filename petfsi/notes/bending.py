@@ -40,10 +40,21 @@ _SAME_PLACE = 1e-6
 
 
 class Span(NamedTuple):
-    """A stretch of a solid between supports or ends that can bend: its length, m, and how its ends are held."""
+    """A stretch of a solid between supports or ends that can bend.
+
+    Attributes
+    ----------
+    length : float
+        m.
+    ends : tuple of str
+        How they are held, in the order of the alphabet.
+    axis : int
+        Along which axis of the solid's form it lies.
+    """
 
     length: float
     ends: tuple[str, str]
+    axis: int = -1
 
     @property
     def slowness(self) -> float:
@@ -54,6 +65,8 @@ class Span(NamedTuple):
 def widest_span(form: Form, fixed: np.ndarray) -> Span | None:
     """Return the span of a solid that bends most slowly; None if there is none as slender as a beam.
 
+    A plate may bend along either of its long axes: one as wide as long is held by what holds one of them.
+
     Parameters
     ----------
     form : Form
@@ -62,40 +75,60 @@ def widest_span(form: Form, fixed: np.ndarray) -> Span | None:
     """
     if not form.slender:
         return None
-    dim = len(form.axes)
-    s = form.points @ form.axes[-1]
-    reach = s.min(), s.max()
-    # as bodies of files are no boxes quite
-    length = float(min(reach[1] - reach[0], form.lengths[-1] * 1.1))
-    sideways = (fixed[:, :dim] & (np.abs(form.axes[0]) > _ALONG)).any(axis=1)
-    at = np.sort(s[sideways])
-    if not len(at):
-        return Span(length, ("free", "free"))
-    at = at[np.concatenate(([True], np.diff(at) > _SAME_PLACE * length))]
-    ends = [*([(reach[0], "free")] if at[0] - reach[0] > _SAME_PLACE * length else [])]
-    ends += [(float(place), _kind(form, fixed, s, at, n)) for n, place in enumerate(at)]
-    ends += [(reach[1], "free")] if reach[1] - at[-1] > _SAME_PLACE * length else []
-    spans = [
-        Span(float(b - a), (min(one, other), max(one, other)))
-        for (a, one), (b, other) in zip(ends[:-1], ends[1:], strict=True)
-        if b - a >= SLENDER * form.thickness
-    ]
+    long = [n for n in range(1, len(form.axes)) if form.lengths[n] >= SLENDER * form.thickness]
+    spans = [span for n in reversed(long) for span in _Line(form, fixed, n).spans()]
     return max(spans, key=lambda span: span.slowness, default=None)
 
 
-def _kind(form: Form, fixed: np.ndarray, s: np.ndarray, at: np.ndarray, n: int) -> str:
-    """Return whether what is held at a place may turn there."""
-    dim, thickness = len(form.axes), form.thickness
-    here = np.abs(s - at[n]) <= _SAME_PLACE * form.lengths[-1]
-    if fixed.shape[1] > dim:
-        turns = not fixed[here, dim:].any()
-    else:
-        lengthwise = here & (fixed[:, :dim] & (np.abs(form.axes[-1]) > _ALONG)).any(axis=1)
-        turns = bool(np.ptp(form.points[lengthwise] @ form.axes[0]) < 0.5 * thickness) if lengthwise.any() else True
-    if turns and fixed.shape[1] == dim:
-        near = np.abs(at - at[n]) < thickness
-        turns = int(near.sum()) < 2  # what is held all along cannot turn
-    return "pinned" if turns else "clamped"
+class _Line:
+    """A long axis of a solid: where its points are along it, and which of them are held sideways and lengthwise."""
+
+    def __init__(self, form: Form, fixed: np.ndarray, axis: int) -> None:
+        dim = len(form.axes)
+        self.form, self.axis = form, axis
+        self.s = form.points @ form.axes[axis]
+        self.sideways, self.lengthwise = (
+            (fixed[:, :dim] & (np.abs(form.axes[n]) > _ALONG)).any(axis=1) for n in (0, axis)
+        )
+        self.angled = fixed.shape[1] > dim  # nodes of beams turn
+        self.turning = fixed[:, dim:].any(axis=1)
+        # as bodies of files are no boxes quite
+        self.length = float(min(np.ptp(self.s), form.lengths[axis] * 1.1))
+        self.near = _SAME_PLACE * self.length
+
+    def spans(self) -> list[Span]:
+        """Return what bends along it; nothing if an end slides without turning, as a plane of symmetry holds it."""
+        first, last = float(self.s.min()), float(self.s.max())
+        at = np.sort(self.s[self.sideways])
+        if any(self._keeps_angle(end) and not (self.sideways & self._here(end)).any() for end in (first, last)):
+            return []
+        if not len(at):
+            return [Span(self.length, ("free", "free"), self.axis)]
+        at = at[np.concatenate(([True], np.diff(at) > self.near))]
+        ends = [*([(first, "free")] if at[0] - first > self.near else [])]
+        ends += [(float(place), self._kind(place, at)) for place in at]
+        ends += [(last, "free")] if last - at[-1] > self.near else []
+        return [
+            Span(float(b - a), (min(one, other), max(one, other)), self.axis)
+            for (a, one), (b, other) in zip(ends[:-1], ends[1:], strict=True)
+            if b - a >= SLENDER * self.form.thickness and ((self.s > a + self.near) & (self.s < b - self.near)).any()
+        ]
+
+    def _here(self, place: float) -> np.ndarray:
+        return np.abs(self.s - place) <= self.near
+
+    def _keeps_angle(self, place: float) -> bool:
+        """Return whether what is held at a place does not turn: by its angle, or lengthwise at more than one height."""
+        here = self._here(place)
+        held = here & self.lengthwise
+        high = np.ptp(self.form.points[held] @ self.form.axes[0]) if held.any() else 0.0
+        return bool((here & self.turning).any() or high >= 0.5 * self.form.thickness)
+
+    def _kind(self, place: float, at: np.ndarray) -> str:
+        """Return how an end is held at one of the places where something is held sideways."""
+        # what is held all along cannot turn
+        all_along = not self.angled and (np.abs(at - place) < self.form.thickness).sum() > 1
+        return "clamped" if self._keeps_angle(place) or all_along else "pinned"
 
 
 def bending_period(solid: Solid, form: Form, span: Span) -> float:
@@ -126,10 +159,13 @@ def carried(form: Form, density: float, fluid: float) -> float:
     return math.pi / 4 * fluid * float(form.lengths[1]) / (density * form.thickness)
 
 
-def excess(solid: Solid, form: Form, volumetric: str) -> float:
-    """Return by which part linear elements bend too stiffly, to a factor of two; ``volumetric`` is as in a scene."""
+def excess(solid: Solid, form: Form, volumetric: str, axis: int = -1) -> float:
+    """Return by which part linear elements bend too stiffly, to a factor of two.
+
+    ``volumetric`` is as in a scene, ``axis`` that of the form along which it bends.
+    """
     a, b = TOO_STIFF[volumetric]
-    size = a + b * float(form.spacing[-1] / form.spacing[0]) ** 2
+    size = a + b * float(form.spacing[axis] / form.spacing[0]) ** 2
     if volumetric == "full":
         bulk = BULK_3D if len(form.axes) == 3 else BULK_2D if solid.shape.mesh is not None else 0.0
         size += bulk * 2 * solid.poisson / (1 - 2 * solid.poisson)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from petfsi.geometry.seams import GOLDEN
 from petfsi.geometry.shapes import bounds, inside
 from petfsi.notes.bending import carried
 from petfsi.notes.forms import Form
@@ -23,8 +24,10 @@ from petfsi.scene.tables import Number
 ENOUGH = 4.0
 #: Cells a step beyond which what is carried is blurred.
 FAST = 5.0
-#: Places along an axis and instants of the run at which speeds are looked at.
-PLACES, INSTANTS = 9, 33
+#: Places along each axis, on a line, over a side and in a box, and instants of the run at which speeds are looked at.
+PLACES, INSTANTS = (1, 257, 33, 9), 97
+#: What is below that many cells a step is round-off.
+NOTHING = 1e-9
 _ROUND_OFF = 1e-9
 
 
@@ -86,7 +89,7 @@ def courant(view: View) -> Notes:
     cell = _cell(scene.fluid)
     found = {key: float((speed / cell).max() * dt) for key, speed in _speeds(view, dt)}
     key = max(found, key=lambda key: found[key], default="")
-    if not found or found[key] == 0:
+    if not found or found[key] < NOTHING:
         yield Note("CFL: no speed is given at which the fluid would cross cells in a step")
         return
     said = f"CFL: {found[key]:.2g} cells a step, by {key}"
@@ -105,7 +108,8 @@ def _speeds(view: View, dt: float) -> Iterator[tuple[str, np.ndarray]]:
     fluid, dim = scene.fluid, scene.dim
     assert fluid is not None
     low, high = np.array(fluid.origin), np.array(fluid.origin) + fluid.size
-    t = np.linspace(0.0, scene.time.end, INSTANTS)
+    # not equally far apart: what is periodic may vanish at all of them
+    t = scene.time.end * np.modf(GOLDEN * np.arange(INSTANTS))[0]
     if fluid.initial.velocity is not None:
         yield "fluid.initial.velocity", _largest(fluid.initial.velocity, _places(low, high), t[:1])
     for axis, pair in enumerate(OPPOSITE[:dim]):
@@ -134,8 +138,10 @@ def _vector(parts: Mapping[Any, Number], dim: int) -> list[Number]:
 
 
 def _places(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return points all over a box, shape (n, dim)."""
-    ends = [np.linspace(a, b, PLACES) for a, b in zip(low, high, strict=True)]
+    """Return points all over a box, a side or a line, shape (n, dim)."""
+    wide = high > low
+    number = np.where(wide, PLACES[int(wide.sum())], 1)
+    ends = [np.linspace(a, b, n) for a, b, n in zip(low, high, number, strict=True)]
     return np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, len(low))
 
 
@@ -146,7 +152,7 @@ def _opening(inflow: Inflow, low: np.ndarray, high: np.ndarray, axis: int, end: 
     if reach is not None:
         low, high = np.maximum(low, reach[0]), np.minimum(high, reach[1])
     low[axis] = high[axis] = end
-    at = np.unique(_places(low, np.maximum(low, high)), axis=0)
+    at = _places(low, np.maximum(low, high))
     return at if inflow.region is None else at[inside(inflow.region, at)]
 
 

@@ -44,24 +44,27 @@ def locking(view: View) -> Notes:
         solid = view.scene.solids[name]
         if solid.shape.beam is not None or solid.elements != "linear" or not _bends(view, name):
             continue
-        part = excess(solid, form, solid.volumetric)
+        span = view.spans[name]
+        axis = -1 if span is None else span.axis
+        part = excess(solid, form, solid.volumetric, axis)
         if part <= STIFF:
             continue
         times = f"about {1 + part:.2g}" if part < MOST_SAID else f"more than {MOST_SAID:g}"
         yield Note(
             f"solids.{name}: linear elements, {form.across:.2g} across it, poisson = {solid.poisson:g}: it bends "
-            f"{times} times too stiffly (locking); {_remedy(solid, form)}",
+            f"{times} times too stiffly (locking); {_remedy(solid, form, axis)}",
             warns=True,
         )
 
 
-def _remedy(solid: Solid, form: Form) -> str:
-    """Return what makes a solid bend as it should."""
-    if form.spacing[-1] > LONG * form.spacing[0]:
+def _remedy(solid: Solid, form: Form, axis: int) -> str:
+    """Return what makes a solid bend along an axis as it should."""
+    if form.spacing[axis] > LONG * form.spacing[0]:
         beam = ", or give it as a beam" if len(form.axes) == 2 else ""
         return f'set elements = "quadratic", with more of them along it{beam}'
     full, reduced = (
-        math.ceil(form.across * math.sqrt(excess(solid, form, kind) / FINE)) for kind in (solid.volumetric, "reduced")
+        math.ceil(form.across * math.sqrt(excess(solid, form, kind, axis) / FINE))
+        for kind in (solid.volumetric, "reduced")
     )
     more = f'volumetric = "reduced" and {reduced}' if reduced < full else f"{full}"
     return f'set elements = "quadratic", or take {more} across it'
