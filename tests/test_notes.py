@@ -226,6 +226,10 @@ def test_check_and_the_log_say_the_same_warnings(tmp_path, here):
     log = (tmp_path / "out" / "log.txt").read_text().splitlines()
     assert [line for line in log if line.startswith("warning: ")] == told
     assert not [line for line in log if "pressure waves" in line]
+    # a run that goes on unchanged has said so; one that is changed is looked at again
+    for sets, times in (((), 1), (("--set", "time.dt=0.02"), 2)):
+        assert here("resume", tmp_path / "out", "--steps", 1, *sets).returncode == 0
+        assert (tmp_path / "out" / "log.txt").read_text().count(told[1]) == times
 
 
 # ---- are they true? -----------------------------------------------------------------------------------------

@@ -50,6 +50,13 @@ def test_a_rigid_rotation_has_twice_its_rate_everywhere(dim, solid):
     assert dim == 3 or np.all(vorticity(-flow, joined(wet, info, [False] * 2, []), info.spacing)[wet] < 0.0), "signed"
 
 
+def test_a_grid_one_cell_thick_has_the_vorticity_of_its_plane():
+    info = GridInfo(INFO.origin, INFO.spacing, (7, 5, 1))
+    flow = np.cross([0.0, 0.0, 0.7], centres(info))
+    found = vorticity(flow, joined(np.ones(info.cells, dtype=bool), info, [False] * 3, []), info.spacing)
+    assert found == pytest.approx(1.4, rel=1e-12)
+
+
 @pytest.mark.parametrize("around", [True, False])
 def test_the_ends_of_a_periodic_axis_are_neighbours(around):
     info = GridInfo((0.0, 0.0), (1 / 16, 1.0), (16, 3))

@@ -147,7 +147,7 @@ def vorticity(velocity: np.ndarray, together: Sequence[np.ndarray], spacing: Seq
     Returns
     -------
     ndarray, shape (nx, ny[, nz])
-        1/s; NaN where a cell has no neighbour along an axis.
+        1/s; NaN where a cell has no neighbour along an axis on which there are others.
     """
 
     def slope(of: int, along: int) -> np.ndarray:
@@ -161,6 +161,8 @@ def vorticity(velocity: np.ndarray, together: Sequence[np.ndarray], spacing: Seq
 
 def _slope(values: np.ndarray, behind: np.ndarray, axis: int, spacing: float) -> np.ndarray:
     """Return the difference quotient along an axis between a cell's neighbours, or from the only one to the cell."""
+    if values.shape[axis] == 1:
+        return np.zeros(values.shape)
     ahead = np.roll(behind, -1, axis)
     after = np.where(ahead, np.roll(values, -1, axis), values)
     before = np.where(behind, np.roll(values, 1, axis), values)

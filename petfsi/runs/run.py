@@ -124,7 +124,9 @@ def resume_run(
                 return DONE
             for line in damaged:
                 console.warn(line)
-            _greet(console, simulation, options, unread, files)
+            # what is wrong with a scene as it was has been said
+            begins = on_root(comm, lambda: _begins(simulation)) if told else ([], [])
+            _greet(console, simulation, options, unread, files, begins)
             console.note(f"resuming at step {found.step}, t = {found.time:.6g} s, from {found.path}")
             run = Run(simulation, files, console, known, lock)
             run.open(after=found.step)
