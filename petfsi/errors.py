@@ -30,6 +30,10 @@ class FinalError(SolveError):
     """What no shorter step helps: it is not tried again."""
 
 
+class EnergyError(SolveError):
+    """There is more energy than a run can have got."""
+
+
 class TouchError(FinalError):
     """Things meet that do not push each other off."""
 

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from petfsi.accounts import Accounts
-from petfsi.errors import SolveError
+from petfsi.errors import EnergyError
 from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.stored import EXACT
 from petfsi.scene.expressions import Expression
@@ -70,7 +70,7 @@ class EnergyGuard:
 
         Raises
         ------
-        SolveError
+        EnergyError
         """
         if not accounts.values:
             return
@@ -84,7 +84,7 @@ class EnergyGuard:
         if not self._watches or self.beyond < PATIENCE:
             return
         grown = max(parts, key=lambda name: parts[name])
-        raise SolveError(
+        raise EnergyError(
             f"energy has come out of nothing, most of it {grown}: there are now "
             f"{', '.join(f'{name} {value:.3g} J' for name, value in parts.items())}; what it began with and what "
             f"gravity, loads and boundaries gave or took since, step by step, come to {got:.3g} J. {advice} "

@@ -416,6 +416,8 @@ def test_what_goes_wrong_only_later_is_a_failed_step(scene, here, setting, said)
     has_failed(done, "out", *said)
     told = json.loads(Path("out/summary.json").read_text())
     last = read_history("out/history.csv")["step"][-1]
+    assert told["failure"]["kind"] in ("diverged", "scene") and told["failure"]["step"] == last + 1
+    assert told["failure"]["checkpoint"] == f"checkpoint/{last:06d}.h5" and told["reason"] in told["failure"]["message"]
     assert told["steps"] == last and f"Last good checkpoint: out/checkpoint/{last:06d}.h5." in done.stderr
     assert all(text in told["reason"] for text in said)
 

@@ -15,8 +15,11 @@ from mpi4py import MPI
 from processes import environment
 
 from petfsi import cli
+from petfsi.errors import EnergyError, FinalError, InputError, NoSolutionError, SolveError, TouchError
 from petfsi.output.history import read_history
+from petfsi.runs.failure import kind_of
 from petfsi.runs.kept import Kept
+from petfsi.runs.running import Run
 from petfsi.runs.stop import SIGNALS, Stop, process_age
 
 PETFSI = Path(sys.executable).with_name("petfsi")
@@ -193,3 +196,54 @@ def test_a_run_that_nobody_can_hear_goes_on(here, closed):
     assert subprocess.run(["bash", "-c", line], env=environment(), timeout=180).returncode == 0
     assert Path("out/log.txt").read_text().count("\nstep ") == 12
     assert summary()["status"] == "done"
+
+
+# ---- what the summary says of it ----------------------------------------------------------------------------
+
+
+def raised(error, *causes):
+    for one, cause in zip([error, *causes], causes, strict=False):
+        one.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    "kind, error",
+    {
+        "interrupted": KeyboardInterrupt(),
+        "memory": raised(SolveError("a solve"), MemoryError()),
+        "disk": raised(SolveError("a row"), SolveError("history.csv"), OSError(28, "full")),
+        "touch": raised(SolveError("step 3"), TouchError("they meet"), SolveError("a solve")),
+        "no-solution": raised(SolveError("step 3"), NoSolutionError("none")),
+        "energy": raised(SolveError("step 3"), FinalError("splitting"), EnergyError("out of nothing")),
+        "scene": raised(SolveError("step 3"), InputError("gravity")),
+        "diverged": raised(SolveError("step 3"), SolveError("solver")),
+        "defect": ZeroDivisionError(),
+    }.items(),
+)
+def test_a_failure_has_a_kind(kind, error):
+    assert kind_of(error) == kind
+
+
+def test_a_summary_says_that_a_run_is_running_from_its_first_moment_on(here, monkeypatch):
+    seen = []
+    monkeypatch.setattr(Run, "loop", lambda run, *args, loop=Run.loop: seen.append(summary()) or loop(run, *args))
+    assert here("run", "block.toml", "--out", "out", "--steps", "4")[0] == 0
+    assert here("resume", "out", "--steps", "4")[0] == 0
+    told = [(one["status"], one["steps"], one["pid"]) for one in seen]
+    assert told == [("running", 0, os.getpid()), ("running", 4, os.getpid())]
+    # of a part that is killed, what was before it stays known
+    assert seen[1]["wall_s"] > 0 and seen[1]["iterations"]["mean"] == 1
+
+
+def test_an_interrupted_run_and_a_defect_say_so(here, monkeypatch):
+    for error, kind in ((KeyboardInterrupt(), "interrupted"), (ZeroDivisionError("0"), "defect")):
+
+        def fail(run, error=error):
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Run, "advance", fail)
+            here("run", "block.toml", "--out", kind)
+        assert summary(kind)["status"] == "failed" and summary(kind)["failure"]["kind"] == kind
+        assert here("resume", kind)[0] == (0 if list(Path(kind, "checkpoint").glob("*.h5")) else 2)

@@ -8,10 +8,12 @@ import os
 import shutil
 import stat
 from pathlib import Path
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from petfsi.ranks import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 _CHUNK = 1 << 24
 _NO_FILE = "no plain file"

@@ -8,16 +8,18 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mpi4py import MPI
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output import files
 from petfsi.output.growing import Changed, Table
 from petfsi.output.manifest import Rows
 from petfsi.ranks import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 #: The columns that hold whole numbers.
 WHOLE = ("step", "iterations", "newton", "substeps")

@@ -19,12 +19,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from petfsi.errors import InputError
 from petfsi.output import files
 from petfsi.ranks import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 #: The lock's name in a run directory.
 NAME = ".lock"

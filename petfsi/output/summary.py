@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import socket
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING, Any, Literal
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output import files
-from petfsi.output.hdf5 import plain
 from petfsi.ranks import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 #: Bytes of the largest summary.
 MOST = 16_000_000
@@ -26,7 +28,8 @@ class Summary:
     Attributes
     ----------
     status : str
-        ``done``, ``stopped`` (resumable) or ``failed``.
+        ``running`` (or killed: then nothing holds the directory's lock), ``done``, ``stopped`` (resumable) or
+        ``failed``.
     reason : str
         Why it stopped or failed.
     steps : int
@@ -53,9 +56,15 @@ class Summary:
         What this scene had no need of, and why.
     versions : dict
         Of petfsi and the libraries that decide its numbers.
+    host : str
+        The machine of rank 0.
+    pid : int
+        Its process there.
+    failure : dict or None
+        Of a run that failed: ``kind`` (see ``runs/failure.py``), ``step``, ``time``, ``message`` and ``checkpoint``.
     """
 
-    status: Literal["done", "stopped", "failed"]
+    status: Literal["running", "done", "stopped", "failed"]
     steps: int
     time: float
     reason: str = ""
@@ -69,12 +78,17 @@ class Summary:
     probes: dict[str, Any] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=dict)
+    host: str = field(default_factory=socket.gethostname)
+    pid: int = field(default_factory=os.getpid)
+    failure: dict[str, Any] | None = None
 
 
 def write_summary(path: Path, summary: Summary, comm: MPI.Comm) -> None:
     """Write the summary, replacing an earlier one in one piece. Collective."""
 
     def write() -> None:
+        from petfsi.output.hdf5 import plain  # HDF5 starts MPI, which those who only read a summary do not
+
         # through JSON once to be rid of NumPy's types, then of the numbers that JSON has no name for
         content = json.loads(json.dumps(asdict(summary), default=plain))
         files.replace_text(Path(path), json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")

@@ -6,7 +6,7 @@ import re
 import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Literal
+from typing import Any, Literal
 
 from mpi4py import MPI
 
@@ -23,6 +23,7 @@ from petfsi.output.summary import Summary, write_summary
 from petfsi.output.xdmf import GridInfo
 from petfsi.runs.console import Console
 from petfsi.runs.effort import Effort, earlier_effort, summed
+from petfsi.runs.failure import describe_failure
 from petfsi.runs.kept import Kept
 from petfsi.runs.plan import skipped
 from petfsi.runs.stop import Stop
@@ -32,7 +33,7 @@ from petfsi.simulation import Simulation
 DONE, STOPPED = 0, 75
 #: Columns of history.csv that a scene has, or not, by what may change when its run goes on.
 SPARE = ("newton", "substeps", "potential", "load_work")
-Status = Literal["done", "stopped", "failed"]
+Status = Literal["running", "done", "stopped", "failed"]
 #: What those who write files say of checkpoints.
 _LAST_GOOD = re.compile(r"\s*(Last good checkpoint: .*\.h5\.|There is no checkpoint\.)")
 
@@ -73,16 +74,19 @@ class Run:
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
-        """Leave a summary that says so when what is done inside fails, in whatever way. Not collective."""
+        """Leave a summary that says that this is running, and when it fails, in whatever way, so. Not collective."""
         first = self.comm.rank == 0
         if first:
             self.files.keep_reserve()
+            with suppress(OSError, SolveError):  # what keeps it from being written keeps the last one, and is told then
+                write_summary(self.files.summary, self.summary("running", ""), MPI.COMM_SELF)
         try:
             yield
         except BaseException as error:
             if first:
                 self.files.free_reserve()
                 summary = self.summary("failed", str(error).split("\n")[0])
+                summary.failure = self._failure(error)
                 with suppress(OSError, SolveError):  # what has failed already is the message, not this
                     write_summary(self.files.summary, summary, MPI.COMM_SELF)
                 self.console.log(f"failed: {error}")
@@ -92,6 +96,13 @@ class Run:
         finally:
             if first:
                 self.files.free_reserve()
+
+    def _failure(self, error: BaseException) -> dict[str, Any]:
+        """Return what the summary says of a failure. Not collective."""
+        step = 1 + max(self._row, -1 if self._saved is None else self._saved)
+        newest = max(self.files.checkpoints.glob("*.h5"), default=None)
+        where = "" if newest is None else str(newest.relative_to(self.files.path))
+        return describe_failure(error, step, self.simulation.time, where)
 
     def loop(self, steps: int | None, stop: Stop) -> int:
         """Step until the scene's end, or ``steps`` times, or until told to stop; return the exit status. Collective."""
