@@ -293,6 +293,38 @@ def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoRet
 
 
 @cli.command()
+@click.argument("target", metavar="SWEEP.toml|DIR", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the sweep; runs/<its file's name> by default.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Ranks at a time; by default one per core.")
+@click.option("--only", default="", metavar="AXIS=POINT,...", help="Take these points alone, e.g. solver=paper.")
+@click.option(
+    "--retry",
+    type=click.Choice(["failed", "lost", "refused", "changed"]),
+    help="Run those of a state again: failed and changed ones from their start, and what was there is put aside.",
+)
+@click.option("--dry-run", is_flag=True, help="Check all and print the runs; write nothing.")
+@click.option("--status", is_flag=True, help="Print what became of the runs; start nothing.")
+@click.option("--collect", is_flag=True, help="Write runs.csv again; start nothing.")
+@click.pass_context
+def sweep(ctx: click.Context, target: Path, **wanted: Any) -> NoReturn:
+    """Run a scene at all points of axes, as SWEEP.toml says, or go on with the sweep in DIR.
+
+    Exit codes: 0 every run has a result, be it that it failed; 1 some are lost or refused; 2 the file is wrong, and
+    nothing was written; 75 stopped, goes on.
+    """
+
+    def work() -> int:
+        if _launched_rank() > 0:
+            return 0
+        from petfsi.sweeps.command import Wanted
+        from petfsi.sweeps.command import sweep as run_sweep
+
+        return run_sweep(Wanted(target, **wanted), _say)
+
+    ctx.exit(_alone(work))
+
+
+@cli.command()
 @click.pass_context
 def info(ctx: click.Context) -> NoReturn:
     """Print versions, what PETSc was built with, solver prefixes and the shipped options files."""

@@ -28,6 +28,8 @@ from petfsi.scene.changes import settings
 MARKER = ".petfsi-run"
 #: Set aside while a run is under way, so that a full disk still takes its last words (bytes).
 RESERVE, RESERVE_BYTES = ".reserve", 16384
+#: What a sweep puts into the directory of a run before that begins.
+PREPARED = ("run.json", "attempts.jsonl", "output.txt", ".claim")
 #: Where a new run's meshes are while an old one is removed.
 STAGED = "meshes.part"
 #: Scene and options may be so long (bytes).
@@ -216,7 +218,8 @@ class RunDirectory:
     def _check_place(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"run directory {self.path}: there is a file of that name")
-        if not self.path.is_dir() or all(entry.name.startswith(LOCK) for entry in self.path.iterdir()):
+        there = [entry.name for entry in self.path.iterdir()] if self.path.is_dir() else []
+        if all(name.startswith(LOCK) or name in PREPARED for name in there):
             return
         if not self._is_run():
             raise InputError(f"run directory {self.path} is not empty and holds no run; name another")

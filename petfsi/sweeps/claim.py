@@ -1,0 +1,65 @@
+"""Whose a run is: whoever starts it claims it first, and the claim is its process's, too, as long as that lives.
+
+The claim is ``flock`` on a file, and the process that runs inherits it: the system gives it back when the last of them
+has ended, however that was. Once a run is under way its directory has a lock besides, which other machines see.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from pathlib import Path
+
+from petfsi.errors import InputError
+from petfsi.output.lock import refuse_if_held
+
+NAME = ".claim"
+#: How often a claim is tried: who only looks whether there is one holds it for a moment.
+_TRIES = 5
+
+
+def claim(path: Path) -> int | None:
+    """Return the handle of a run's claim; None where it is another's, or a process is at work in it."""
+    handle = os.open(path / NAME, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    for _ in range(_TRIES):
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.005)
+            continue
+        if not works(path):
+            return handle
+        break
+    os.close(handle)
+    return None
+
+
+def give_back(handle: int) -> None:
+    """Give a claim back, also for those who have inherited it: MPI's daemon outlives its process by a moment."""
+    fcntl.flock(handle, fcntl.LOCK_UN)
+    os.close(handle)
+
+
+def is_busy(path: Path) -> bool:
+    """Return whether a run is claimed, or a process is at work in it."""
+    try:
+        handle = os.open(path / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return works(path)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(handle)
+    return works(path)
+
+
+def works(path: Path) -> bool:
+    """Return whether a process holds the lock of a run's directory."""
+    try:
+        refuse_if_held(path)
+    except InputError:
+        return True
+    return False

@@ -1,0 +1,245 @@
+"""What ``petfsi sweep`` does: from a sweep's file or folder to runs with a result."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from petfsi.errors import InputError
+from petfsi.messages import shown
+from petfsi.output import files
+from petfsi.sweeps import attempts
+from petfsi.sweeps.claim import claim, give_back
+from petfsi.sweeps.file import read_selection
+from petfsi.sweeps.folder import SweepFolder, axes_of, describe_changed
+from petfsi.sweeps.names import same_point
+from petfsi.sweeps.plan import Plan, Planned, plan_sweep
+from petfsi.sweeps.pool import Pool
+from petfsi.sweeps.states import RESULTS, STATES, look_at
+from petfsi.sweeps.table import collect
+
+DONE, LEFT, INTERRUPTED = 0, 1, 75
+RETRY = ("failed", "lost", "refused", "changed")
+#: Runs that are named in what is said at the end.
+_TOLD = 10
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a call of ``petfsi sweep`` is to do.
+
+    Attributes
+    ----------
+    target : Path
+        A sweep's file, or its folder.
+    out : Path or None
+        Of a file the folder; ``runs/<its name>`` by default.
+    jobs : int or None
+        Ranks at a time; by default as many as there are cores for this process.
+    only : str
+        ``axis=point,...``; empty for all.
+    retry : str or None
+        One of ``RETRY``.
+    dry_run, status, collect : bool
+        To do nothing but say what would be done, what is, or write the table.
+    """
+
+    target: Path
+    out: Path | None = None
+    jobs: int | None = None
+    only: str = ""
+    retry: str | None = None
+    dry_run: bool = False
+    status: bool = False
+    collect: bool = False
+
+
+def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
+    """Do it; return the exit status: 0 every run has a result, 1 some are lost or refused, 75 some are still to run.
+
+    Raises
+    ------
+    InputError
+        With every mistake in the file, or what of the folder does not fit it; nothing has been written then.
+    """
+    folder, plan = _open(wanted)
+    runs = folder.planned() if plan is None else plan.runs
+    chosen = _chosen(wanted, runs)
+    _check_launcher(chosen)
+    if wanted.dry_run:
+        _say_plan(folder, chosen, say)
+        return DONE
+    if wanted.status:
+        return _say_states(folder, runs, chosen, say, whole=True)
+    if plan is not None:
+        _make(folder, plan, wanted, say)
+    if wanted.collect:
+        rows = collect(folder, runs)
+        say(f"{folder.table}: {len(rows)} runs")
+        return DONE
+    if wanted.retry in ("failed", "lost", "refused"):
+        _retry(folder, chosen, wanted.retry, say)
+    cores = wanted.jobs or len(os.sched_getaffinity(0))
+    why = Pool(folder, chosen, cores, say).work()
+    _say_states(folder, runs, chosen, say)
+    try:
+        collect(folder, runs)
+        say(f"{folder.table}: a row for each; again with: petfsi sweep {folder.path} --collect")
+    except OSError as error:
+        say(f"{folder.table} could not be written: {files.reason(error)}")
+    if why:
+        say(f"stopped by {why}; go on with: petfsi sweep {folder.path}")
+        return INTERRUPTED
+    return _code(folder, chosen)
+
+
+def _open(wanted: Wanted) -> tuple[SweepFolder, Plan | None]:
+    """Return the folder, and of a file its plan; nothing is written."""
+    if wanted.target.is_dir():
+        if wanted.out is not None:
+            raise InputError("--out is for a sweep's file: a folder stays where it is, and can be moved as a whole")
+        if wanted.retry == "changed":
+            raise InputError("--retry changed needs the sweep's file, which says what is to be run instead")
+        return SweepFolder.open(wanted.target), None
+    plan = plan_sweep(wanted.target)
+    folder = SweepFolder(wanted.out or Path("runs") / wanted.target.stem)
+    folder.check_place()
+    if folder.is_sweep():
+        SweepFolder.open(folder.path)
+    elif wanted.status or wanted.collect or wanted.retry:
+        raise InputError(f"{shown(folder.path, 200)}: there is no sweep yet")
+    changed = folder.changed(plan)
+    if changed and wanted.retry != "changed":
+        raise InputError(
+            "\n".join(
+                [
+                    f"{folder.path}: {len(changed)} run{'s' * (len(changed) > 1)} of the same name had other settings",
+                    *(f"  {line}" for line in describe_changed(changed)),
+                    "  give the sweep another folder with --out, or replace these runs with --retry changed",
+                ]
+            )
+        )
+    return folder, plan
+
+
+def _make(folder: SweepFolder, plan: Plan, wanted: Wanted, say: Callable[[str], None]) -> None:
+    """Write what runs start from, and put aside those that are to be replaced."""
+    changed = folder.changed(plan) if wanted.retry == "changed" else {}
+    chosen = {run.name for run in _chosen(wanted, plan.runs)}
+    if kept := [name for name in changed if name not in chosen]:
+        raise InputError(f"{kept[0]} has changed, too: --retry changed takes no --only that leaves such runs out")
+    folder.make(plan)
+    for run in plan.runs:
+        if run.name in changed:
+            _set_aside(folder, run, say)
+    if left := folder.left_over(plan.runs):
+        names = ", ".join(left[:_TOLD]) + " ..." * (len(left) > _TOLD)
+        say(f"{len(left)} runs in {folder.path} are in the sweep's file no more, and stay as they are: {names}")
+
+
+def _set_aside(folder: SweepFolder, run: Planned, say: Callable[[str], None]) -> None:
+    handle = claim(folder.run(run.name))
+    if handle is None:
+        raise InputError(f"{folder.run(run.name)}: a process is at work in it; wait for it, or stop it")
+    try:
+        say(f"{run.name} begins anew; what was there is in {folder.set_aside(run)}")
+    finally:
+        give_back(handle)
+
+
+def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, say: Callable[[str], None]) -> None:
+    """Let runs of a state be tried again: failed ones from their start, others from where they are."""
+    for run in chosen:
+        path = folder.run(run.name)
+        if look_at(path, run).state != state:
+            continue
+        if state == "failed":
+            _set_aside(folder, run, say)
+        else:
+            attempts.again(path, state)
+
+
+def _chosen(wanted: Wanted, runs: Sequence[Planned]) -> list[Planned]:
+    """Return the runs that ``--only`` names."""
+    if not wanted.only:
+        return list(runs)
+    rules = read_selection(wanted.only, axes_of(runs))
+    found = [
+        run
+        for run in runs
+        if all(any(same_point(run.axes[axis], one) for one in points) for axis, points in rules.items())
+    ]
+    if not found:
+        raise InputError(f"--only {shown(wanted.only, 200)}: no run is at these points; they are excluded")
+    return found
+
+
+def _check_launcher(runs: Sequence[Planned]) -> None:
+    several = [run.name for run in runs if run.ranks > 1]
+    if several and shutil.which("mpirun") is None:
+        raise InputError(f"{several[0]} has several ranks, and there is no mpirun on this machine")
+
+
+def _code(folder: SweepFolder, chosen: Sequence[Planned]) -> int:
+    states = {look_at(folder.run(run.name), run).state for run in chosen}
+    if states & {"lost", "refused"}:
+        return LEFT
+    return DONE if states <= set(RESULTS) else INTERRUPTED
+
+
+# ---- what is said -------------------------------------------------------------------------------------------
+
+
+def _say_plan(folder: SweepFolder, chosen: Sequence[Planned], say: Callable[[str], None]) -> None:
+    """Say what would be run, without making anything."""
+    states: Counter[str] = Counter()
+    for run in chosen:
+        state = look_at(folder.run(run.name), run).state if folder.run(run.name).is_dir() else "new"
+        states[state] += 1
+        say(f"{run.name}  {state}, {run.ranks} rank{'s' * (run.ranks > 1)}")
+    say(f"{len(chosen)} runs in {folder.path}: {_counts(states)}; nothing was written")
+
+
+def _say_states(
+    folder: SweepFolder,
+    runs: Sequence[Planned],
+    chosen: Sequence[Planned],
+    say: Callable[[str], None],
+    whole: bool = False,
+) -> int:
+    """Say how many runs are in which state, and of those that are not done why; return 0."""
+    looks = {run.name: look_at(folder.run(run.name), run) for run in chosen}
+    for state in STATES[1:]:
+        named = [(name, look) for name, look in looks.items() if look.state == state]
+        most = len(named) if whole else _TOLD
+        for name, look in named[:most]:
+            reason = f": {shown(look.reason, 300)}" if look.reason else ""
+            steps = f", step {look.step}" if look.step >= 0 else ""
+            if whole or state not in ("new", "running"):
+                say(f"{name}: {state}{steps}{reason}")
+        if len(named) > most and state not in ("new", "running"):
+            say(f"and {len(named) - most} more {state}")
+    counts = Counter(look.state for look in looks.values())
+    rest = "" if len(chosen) == len(runs) else f" of {len(runs)}"
+    say(f"{len(chosen)}{rest} runs: {_counts(counts)}{_time_left(looks)}")
+    return DONE
+
+
+def _counts(states: Counter[str]) -> str:
+    return ", ".join(f"{states[state]} {state}" for state in STATES if states[state]) or "none"
+
+
+def _time_left(looks: dict[str, Any]) -> str:
+    """Return how long what is left may take, if it is like what has ended."""
+    known = [float(one.summary["wall_s"]) for one in looks.values() if one.state == "done" and "wall_s" in one.summary]
+    left = sum(look.state not in (*RESULTS, "lost", "refused") for look in looks.values())
+    if not known or not left:
+        return ""
+    each = sum(known) / len(known)
+    spread = f"{min(known):.3g} to {max(known):.3g} s a run"
+    return f"; about {left * each / len(os.sched_getaffinity(0)):.3g} s left here ({spread})"

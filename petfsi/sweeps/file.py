@@ -1,0 +1,278 @@
+"""A sweep's file: which scene, which axes, and what of them is left out. All mistakes are found before any is told."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from petfsi.errors import InputError
+from petfsi.messages import shown
+from petfsi.scene.dump import as_toml
+from petfsi.scene.raw import read_raw
+from petfsi.sweeps.names import point_text, same_point
+from petfsi.sweeps.values import read_values
+
+KEYS = ("scene", "set", "repeat", "steps", "axis", "exclude")
+#: Words of an axis whose points are values, and of a point that has a name.
+BY_VALUE, BY_NAME = ("key", "option", "ranks", "values"), ("options_file", "options", "set", "ranks")
+#: Runs of the largest sweep, ranks of the largest run, and rounds.
+MOST_RUNS, MOST_RANKS, MOST_ROUNDS = 100_000, 100_000, 1000
+_AXIS = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of an axis, and what it changes.
+
+    Attributes
+    ----------
+    text : str
+        Its name, or its value.
+    sets : dict of str to str
+        Keys of the scene and their values, as TOML.
+    options : dict of str to str
+        Of PETSc, without the dash.
+    options_file : str
+        As it was named; empty if none is.
+    ranks : int or None
+    """
+
+    text: str
+    sets: dict[str, str] = field(default_factory=dict)
+    options: dict[str, str] = field(default_factory=dict)
+    options_file: str = ""
+    ranks: int | None = None
+
+    def touches(self) -> set[str]:
+        """Return what it decides, in the words of a file."""
+        named = {"options_file"} if self.options_file else set()
+        ranks = set() if self.ranks is None else {"ranks"}
+        return {f"set.{key}" for key in self.sets} | {f"options.{name}" for name in self.options} | named | ranks
+
+
+@dataclass(frozen=True)
+class SweepFile:
+    """What a sweep's file says.
+
+    Attributes
+    ----------
+    path, scene : Path
+    text : bytes
+        As given.
+    sets : dict of str to str
+        For every run, as TOML.
+    repeat : int
+    steps : int or None
+    axes : dict of str to list of Point
+    excluded : list of dict
+        By axis the points that do not go together.
+    """
+
+    path: Path
+    text: bytes
+    scene: Path
+    sets: dict[str, str]
+    repeat: int
+    steps: int | None
+    axes: dict[str, list[Point]]
+    excluded: list[dict[str, list[str]]]
+
+    def excludes(self, points: Mapping[str, Point]) -> bool:
+        """Return whether a combination of points is left out."""
+        return any(
+            all(any(same_point(points[axis].text, one) for one in wanted) for axis, wanted in rule.items())
+            for rule in self.excluded
+        )
+
+
+def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
+    """Return what a file says; what is wrong with it is added to ``mistakes``, and left out.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is no TOML.
+    """
+    if not path.exists():
+        raise InputError(f"{shown(path, 200)}: no such file; a sweep is a TOML file, or the folder of an earlier one")
+    data = read_raw(path)
+    for key in data:
+        if key not in KEYS:
+            near = difflib.get_close_matches(key, KEYS, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known here are {', '.join(KEYS)}"
+            mistakes.append(f"{shown(key)}: no such key of a sweep; {hint}")
+    scene = data.get("scene")
+    if not isinstance(scene, str) or not scene:
+        mistakes.append("scene: must name a scene's file, relative to this one")
+        scene = ""
+    axes = _axes(data.get("axis", {}), mistakes)
+    return SweepFile(
+        path=path,
+        text=path.read_bytes(),
+        scene=path.parent / scene,
+        sets=_settings("set", data.get("set", {}), mistakes),
+        repeat=_whole("repeat", data.get("repeat", 1), MOST_ROUNDS, mistakes) or 1,
+        steps=_whole("steps", data["steps"], 2**53, mistakes) if "steps" in data else None,
+        axes=axes,
+        excluded=_excluded(data.get("exclude", []), data.get("axis", {}), axes, mistakes),
+    )
+
+
+def read_selection(text: str, axes: Mapping[str, list[str]]) -> dict[str, list[str]]:
+    """Return by axis the points that ``--only 'axis=point,...'`` names; several of an axis are alternatives."""
+    found: dict[str, list[str]] = {}
+    for part in text.split(","):
+        axis, separator, point = (word.strip() for word in part.partition("="))
+        if not separator or axis not in axes:
+            raise InputError(f"--only {shown(part)}: must be axis=point; axes are {', '.join(axes) or 'none'}")
+        if not any(same_point(one, point) for one in axes[axis]):
+            raise InputError(f"--only {shown(part)}: no such point; {axis} has {shown(', '.join(axes[axis]), 500)}")
+        found.setdefault(axis, []).append(point)
+    return found
+
+
+# ---- axes ---------------------------------------------------------------------------------------------------
+
+
+def _axes(given: Any, mistakes: list[str]) -> dict[str, list[Point]]:
+    if not isinstance(given, dict):
+        mistakes.append("axis: must be a table of axes")
+        return {}
+    found: dict[str, list[Point]] = {}
+    by: dict[str, str] = {}
+    for name, axis in given.items():
+        key = f"axis.{shown(name)}"
+        if not _AXIS.fullmatch(name) or len(name) > 60:
+            mistakes.append(f"{key}: an axis's name has up to 60 letters, digits and . _ + -, the first no sign")
+        elif not isinstance(axis, dict) or not axis:
+            mistakes.append(f"{key}: must be a table of points, or have key, option or ranks with values")
+        else:
+            by_value = any(word in axis for word in BY_VALUE)
+            found[name] = _points_by_value(key, axis, mistakes) if by_value else _named_points(key, axis, mistakes)
+            for what in sorted({what for point in found[name] for what in point.touches()}):
+                if by.setdefault(what, name) != name:
+                    mistakes.append(f"{key}: decides {shown(what)}, as axis.{by[what]} does")
+    return {name: points for name, points in found.items() if points}  # what the others say can still be judged
+
+
+def _points_by_value(key: str, axis: dict[str, Any], mistakes: list[str]) -> list[Point]:
+    """Return the points of an axis of values: of a key of the scene, an option, or ranks."""
+    what = [word for word in ("key", "option", "ranks") if word in axis]
+    for word in (word for word in axis if word not in BY_VALUE):
+        mistakes.append(f"{key}.{shown(word)}: no such word of an axis of values: key, option or ranks, and values")
+    if len(what) != 1:
+        mistakes.append(f"{key}: must have one of key, option and ranks, and has {' and '.join(what) or 'none'}")
+        return []
+    if what[0] == "ranks" and "values" in axis:
+        mistakes.append(f"{key}.values: the values of ranks stand there: ranks = [1, 2]")
+        return []
+    place = f"{key}.ranks" if what[0] == "ranks" else f"{key}.values"
+    values = read_values(place, axis["ranks"] if what[0] == "ranks" else axis.get("values"), mistakes)
+    texts = [point_text(value) for value in values]
+    for text in sorted({text for text in texts if texts.count(text) > 1}):
+        mistakes.append(f"{place}: {shown(text)} stands there twice")
+    if what[0] == "ranks":
+        counts = [_whole(place, value, MOST_RANKS, mistakes) for value in values]
+        return [Point(text, ranks=count) for text, count in zip(texts, counts, strict=True)]
+    target = axis[what[0]]
+    if not isinstance(target, str) or not target:
+        mistakes.append(f"{key}.{what[0]}: must be a text in quotes")
+        return []
+    if what[0] == "option":
+        found = [_options(place, {target: value}, mistakes) for value in values]
+        return [Point(text, options=one) for text, one in zip(texts, found, strict=True)]
+    return [Point(text, sets={target: as_toml(value)}) for text, value in zip(texts, values, strict=True)]
+
+
+def _named_points(key: str, axis: dict[str, Any], mistakes: list[str]) -> list[Point]:
+    found = []
+    for name, point in axis.items():
+        here = f"{key}.{shown(name)}"
+        if not isinstance(point, dict):
+            mistakes.append(f"{here}: must be a table, of {', '.join(BY_NAME)}")
+            continue
+        for word in (word for word in point if word not in BY_NAME):
+            mistakes.append(f"{here}.{shown(word)}: no such word of a point; it may have {', '.join(BY_NAME)}")
+        file = point.get("options_file", "")
+        if not isinstance(file, str) or ("options_file" in point and not file):
+            mistakes.append(f"{here}.options_file: must name an options file")
+            file = ""
+        found.append(
+            Point(
+                name,
+                sets=_settings(f"{here}.set", point.get("set", {}), mistakes),
+                options=_options(f"{here}.options", point.get("options", {}), mistakes),
+                options_file=file,
+                ranks=_whole(f"{here}.ranks", point["ranks"], MOST_RANKS, mistakes) if "ranks" in point else None,
+            )
+        )
+    return found
+
+
+def _excluded(
+    given: Any, tables: Any, axes: Mapping[str, list[Point]], mistakes: list[str]
+) -> list[dict[str, list[str]]]:
+    """Return the rules of ``[[exclude]]`` that can be followed."""
+    if not isinstance(given, list) or not all(isinstance(rule, dict) and rule for rule in given):
+        mistakes.append("exclude: must be [[exclude]] tables, of axes and their points")
+        return []
+    found = []
+    for number, rule in enumerate(given):
+        wanted = {axis: [point_text(one) for one in (v if isinstance(v, list) else [v])] for axis, v in rule.items()}
+        right = True
+        for axis, points in wanted.items():
+            if axis not in axes:
+                right = False
+                if not isinstance(tables, dict) or axis not in tables:  # else what is wrong with it is told already
+                    mistakes.append(f"exclude.{number}.{shown(axis)}: there is no such axis")
+                continue
+            for point in points:
+                if not any(same_point(one.text, point) for one in axes[axis]):
+                    right = False
+                    mistakes.append(f"exclude.{number}.{axis} = {shown(point)}: the axis has no such point")
+        found += [wanted] if right else []
+    return found
+
+
+# ---- entries ------------------------------------------------------------------------------------------------
+
+
+def _settings(key: str, given: Any, mistakes: list[str]) -> dict[str, str]:
+    """Return settings of a scene as TOML, by key."""
+    if not isinstance(given, dict):
+        mistakes.append(f"{key}: must be a table of keys and values")
+        return {}
+    found = {}
+    for name, value in given.items():
+        if isinstance(value, dict) and "." not in name:
+            # TOML reads time.end = 1 as a table [time], which as a setting would take the place of the scene's own
+            mistakes.append(f'{key}.{shown(name)}: is a table; keys of a scene stand in quotes: "{shown(name)}...." = ')
+        else:
+            found[name] = as_toml(value)
+    return found
+
+
+def _options(key: str, given: Any, mistakes: list[str]) -> dict[str, str]:
+    if not isinstance(given, dict):
+        mistakes.append(f"{key}: must be a table of options and their values")
+        return {}
+    found = {}
+    for name, value in given.items():
+        if isinstance(value, dict | list):
+            mistakes.append(f"{key}.{shown(name)}: an option's value is a number, a text, true or false")
+        elif name.lstrip("-").lower() == "options_file":
+            mistakes.append(f"{key}.{shown(name)}: options_file is a word of its own, beside options")
+        else:
+            found[name.lstrip("-").lower()] = point_text(value)
+    return found
+
+
+def _whole(key: str, value: Any, most: int, mistakes: list[str]) -> int | None:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        mistakes.append(f"{key} = {shown(value)}: must be a whole number from 1 to {most:,}")
+        return None
+    return value

@@ -1,0 +1,223 @@
+"""The folder of a sweep: its file, its plan, what its runs need, and their run directories. It can be moved."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import petfsi
+from petfsi.errors import InputError
+from petfsi.messages import shown
+from petfsi.output import files
+from petfsi.sweeps.plan import INPUTS, Plan, Planned
+
+#: Marks a folder as a sweep's.
+MARKER, FORMAT = ".petfsi-sweep", 1
+#: In a run's directory: which run of a sweep it is, and what it printed.
+RUN, OUTPUT = "run.json", "output.txt"
+RUNS, REPLACED = "runs", "replaced"
+#: Marks a run's directory once it has begun; who asks for that alone need not start MPI for it.
+BEGUN = ".petfsi-run"
+#: Bytes of the largest ``run.json``.
+_MOST = 16_000_000
+#: Runs, and keys of each, that a message names.
+_TOLD, _KEYS = 8, 6
+
+
+@dataclass(frozen=True)
+class SweepFolder:
+    """The paths of a sweep."""
+
+    path: Path
+
+    @property
+    def plan(self) -> Path:
+        """A row for every run that the sweep's file asks for."""
+        return self.path / "plan.csv"
+
+    @property
+    def table(self) -> Path:
+        """A row for every run, with what came out."""
+        return self.path / "runs.csv"
+
+    @property
+    def inputs(self) -> Path:
+        """Scenes, options files and meshes."""
+        return self.path / INPUTS
+
+    def run(self, name: str) -> Path:
+        """Return the directory of a run."""
+        return self.path / RUNS / name
+
+    @classmethod
+    def open(cls, path: Path) -> SweepFolder:
+        """Return an existing sweep; InputError if it is none."""
+        folder = cls(Path(path))
+        if not folder.is_sweep():
+            raise InputError(f"{shown(path, 200)} is not the folder of a sweep: it has no {MARKER}")
+        try:
+            number = json.loads(files.read_plain(folder.path / MARKER, _MOST)).get("format")
+        except (OSError, ValueError, AttributeError):
+            raise InputError(f"{folder.path / MARKER} cannot be read") from None
+        if number != FORMAT:
+            raise InputError(f"{shown(path, 200)} is a sweep of format {shown(number)}; this petfsi reads {FORMAT}")
+        return folder
+
+    def is_sweep(self) -> bool:
+        """Return whether there is one."""
+        return (self.path / MARKER).is_file()
+
+    def check_place(self) -> None:
+        """Raise InputError unless a sweep is here, or can be; writes nothing."""
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"sweep folder {self.path}: there is a file of that name")
+        if self.path.is_dir() and not self.is_sweep() and any(self.path.iterdir()):
+            raise InputError(f"sweep folder {self.path} is not empty and holds no sweep; name another with --out")
+
+    # ---- what is to be ------------------------------------------------------------------------------------------
+
+    def planned(self) -> list[Planned]:
+        """Return the runs of the plan, in its order.
+
+        Raises
+        ------
+        InputError
+            If it was not written whole, or a run's ``run.json`` has gone.
+        """
+        if not self.plan.is_file():
+            raise InputError(f"{self.path} was not made whole; once more: petfsi sweep SWEEP.toml --out {self.path}")
+        with open(self.plan, encoding="utf-8", newline="") as file:
+            names = [row["name"] for row in csv.DictReader(file)]
+        found = [self.read_run(name) for name in names]
+        missing = [name for name, run in zip(names, found, strict=True) if run is None]
+        if missing:
+            raise InputError(
+                f"{self.run(missing[0]) / RUN} cannot be read; it is written anew by: petfsi sweep SWEEP.toml "
+                f"--out {self.path}"
+            )
+        return [run for run in found if run is not None]
+
+    def read_run(self, name: str) -> Planned | None:
+        """Return what a run's directory says that it is; None if it does not."""
+        try:
+            data = json.loads(files.read_small(self.run(name) / RUN, _MOST))
+            data.pop("hash")
+            return Planned(**data)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            return None
+
+    def changed(self, plan: Plan) -> dict[str, list[str]]:
+        """Return by name the runs that are here with other settings, and in words what differs."""
+        found = {}
+        for run in plan.runs:
+            old = self.read_run(run.name)
+            if old is not None and old.hash != run.hash:
+                keys = dict.fromkeys([*old.says, *run.says])
+                found[run.name] = [
+                    f"{key} was {shown(old.says.get(key, 'none'))}, is {shown(run.says.get(key, 'none'))}"
+                    for key in keys
+                    if old.says.get(key) != run.says.get(key)
+                ]
+        return found
+
+    def left_over(self, runs: Sequence[Planned]) -> list[str]:
+        """Return the names of runs that are here, and are not in the plan any more."""
+        known = {run.name for run in runs}
+        there = sorted(path.parent.name for path in (self.path / RUNS).glob(f"*/{RUN}"))
+        return [name for name in there if name not in known]
+
+    def make(self, plan: Plan) -> None:
+        """Write all that runs start from; what is here stays. The plan is last: what was cut short has none."""
+        self.inputs.mkdir(parents=True, exist_ok=True)
+        marker = {"petfsi": petfsi.__version__, "format": FORMAT}
+        if not self.is_sweep():
+            files.replace_text(self.path / MARKER, json.dumps(marker) + "\n")
+        for name, source in plan.meshes.items():
+            target = self.inputs / name
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                part = files.part_of(target)
+                shutil.copyfile(source, part)
+                os.replace(part, target)
+        for name, data in plan.files.items():
+            if not (self.inputs / name).exists():
+                _replace(self.inputs / name, data)
+        for run in plan.runs:
+            if self.read_run(run.name) is None:
+                self.prepare(run)
+        files.replace_text(self.path / "sweep.toml", plan.text)
+        files.replace_text(self.plan, _plan_text(plan))
+
+    def prepare(self, run: Planned) -> None:
+        """Write a run's directory, empty but for what it is."""
+        self.run(run.name).mkdir(parents=True, exist_ok=True)
+        about = {**asdict(run), "hash": run.hash}
+        _replace(self.run(run.name) / RUN, (json.dumps(about, indent=1) + "\n").encode())
+
+    def set_aside(self, run: Planned) -> Path:
+        """Move a run's directory to where replaced ones are, and make a new one; return where it is now."""
+        numbers = (self.path / REPLACED / f"{run.name}.{n}" for n in range(1, 1 << 20))
+        aside = next(path for path in numbers if not path.exists())
+        aside.parent.mkdir(exist_ok=True)
+        os.rename(self.run(run.name), aside)
+        self.prepare(run)
+        return aside
+
+
+def axes_of(runs: Sequence[Planned]) -> dict[str, list[str]]:
+    """Return by axis the points that runs have."""
+    found: dict[str, list[str]] = {}
+    for run in runs:
+        for axis, point in run.axes.items():
+            points = found.setdefault(axis, [])
+            if point not in points:
+                points.append(point)
+    return found
+
+
+def describe_changed(changed: dict[str, list[str]]) -> Iterator[str]:
+    """Return lines about runs that are not what they were."""
+    for name, keys in list(changed.items())[:_TOLD]:
+        more = f"; and {len(keys) - _KEYS} more" if len(keys) > _KEYS else ""
+        yield f"{name}: {'; '.join(keys[:_KEYS])}{more}"
+    if len(changed) > _TOLD:
+        yield f"and {len(changed) - _TOLD} more runs"
+
+
+def _plan_text(plan: Plan) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    # an axis may have the name of another column
+    writer.writerow(["name", *(f"axis.{axis}" for axis in plan.axes), "ranks", "repeat", "hash"])
+    for run in plan.runs:
+        writer.writerow([run.name, *run.axes.values(), run.ranks, run.repeat, run.hash])
+    return out.getvalue()
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Give a file its content in one piece; of thousands none is waited for until it is on the disk."""
+    part = files.part_of(path)
+    try:
+        part.write_bytes(data)
+        os.replace(part, path)
+    except OSError:
+        with suppress(OSError):
+            part.unlink()
+        raise
+
+
+def known(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file that a run wrote, or nothing of one that cannot be read."""
+    try:
+        data = json.loads(files.read_small(path, _MOST))
+        return data if isinstance(data, dict) else {}
+    except (OSError, ValueError, RecursionError):
+        return {}

@@ -1,0 +1,265 @@
+"""From a sweep's file to its runs: every combination is built as a scene, and its options are read, before any starts.
+
+Knows no PETSc and no MPI, and writes nothing.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import itertools
+import json
+import math
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from petfsi.errors import InputError
+from petfsi.messages import shown
+from petfsi.output.mesh_files import MeshFile, mesh_files
+from petfsi.scene.dump import as_toml, dump_scene
+from petfsi.scene.load import apply_set, scene_from_dict
+from petfsi.scene.raw import read_raw
+from petfsi.solving import options
+from petfsi.sweeps.file import MOST_RUNS, Point, SweepFile, read_sweep_file
+from petfsi.sweeps.names import run_name
+
+#: Where scenes, options files and meshes of the runs are, in a sweep's folder.
+INPUTS = "inputs"
+#: Digits of digests in names of files.
+_DIGITS = 12
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A run that is to be.
+
+    Attributes
+    ----------
+    name : str
+    axes : dict of str to str
+        By axis its point.
+    ranks, repeat : int
+    steps : int or None
+        How many, where not all to the scene's end.
+    scene : str
+        File of the resolved scene, relative to the sweep's folder.
+    options : list of str
+        Words of PETSc's options, as for ``petfsi run``; files are relative to ``INPUTS``.
+    says : dict of str to str
+        All that the run hangs on, by key, as TOML: the settings of the scene, options, ranks, repeat, steps.
+    """
+
+    name: str
+    axes: dict[str, str]
+    ranks: int
+    repeat: int
+    steps: int | None
+    scene: str
+    options: list[str]
+    says: dict[str, str]
+
+    @property
+    def hash(self) -> str:
+        """What tells whether a run of the same name is the same: neither machine nor time nor folder enter."""
+        return hashlib.sha256(json.dumps(self.says, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass
+class Plan:
+    """The runs of a sweep, and the files that they need.
+
+    Attributes
+    ----------
+    text : bytes
+        The sweep's file, as given.
+    axes : dict of str to list of str
+        By axis its points.
+    runs : list of Planned
+        In the file's order, rounds of ``repeat`` outermost.
+    files : dict of str to bytes
+        By name in ``INPUTS``: scenes and options files.
+    meshes : dict of str to Path
+        By name in ``INPUTS``: mesh files, and where they are now.
+    """
+
+    text: bytes
+    axes: dict[str, list[str]]
+    runs: list[Planned] = field(default_factory=list)
+    files: dict[str, bytes] = field(default_factory=dict)
+    meshes: dict[str, Path] = field(default_factory=dict)
+
+
+def plan_sweep(path: Path) -> Plan:
+    """Return the runs of a sweep's file.
+
+    Raises
+    ------
+    InputError
+        With every mistake in the file, the scenes and the options.
+    """
+    mistakes: list[str] = []
+    file = read_sweep_file(path, mistakes)
+    planner = _Planner(file, mistakes)
+    if file.scene != path.parent:
+        planner.build()
+    if mistakes:
+        told = list(dict.fromkeys(mistakes))
+        count = "one mistake" if len(told) == 1 else f"{len(told)} mistakes"
+        raise InputError("\n".join([f"{shown(path, 200)}: {count}", *(f"  {line}" for line in told)]))
+    return planner.plan
+
+
+class _Planner:
+    """Builds the runs of a file; combinations of the same settings share a scene, those of the same words a file."""
+
+    def __init__(self, file: SweepFile, mistakes: list[str]) -> None:
+        self.file, self.mistakes = file, mistakes
+        axes = {name: [point.text for point in points] for name, points in file.axes.items()}
+        self.plan = Plan(file.text, axes)
+        self._base: dict[str, Any] = {}
+        self._scenes: dict[str, tuple[str, dict[str, str]] | None] = {}
+        self._options: dict[str, tuple[list[str], dict[str, str]] | None] = {}
+
+    def build(self) -> None:
+        """Fill the plan."""
+        file = self.file
+        count = math.prod(len(points) for points in file.axes.values()) * file.repeat
+        if count > MOST_RUNS:
+            self.mistakes.append(f"axis: {count:,} combinations; a sweep has at most {MOST_RUNS:,} runs")
+            return
+        try:
+            self._base = read_raw(file.scene)
+        except InputError as error:
+            self.mistakes.append(f"scene: {error}")
+            return
+        for repeat in range(1, file.repeat + 1):
+            for points in _combinations(file):
+                self._add(points, repeat)
+        if not self.plan.runs and not self.mistakes:
+            self.mistakes.append("exclude: leaves no run")
+
+    def _add(self, points: dict[str, Point], repeat: int) -> None:
+        texts = {axis: point.text for axis, point in points.items()}
+        name = run_name(list(texts.items()), repeat)
+        scene, chosen = self._scene(points, name), self._chosen(points, name)
+        if scene is None or chosen is None:
+            return
+        ranks = next((point.ranks for point in points.values() if point.ranks), 1)
+        steps = self.file.steps
+        says = {**scene[1], **chosen[1], "ranks": str(ranks), "repeat": str(repeat), "steps": str(steps or "all")}
+        self.plan.runs.append(Planned(name, texts, ranks, repeat, steps, scene[0], chosen[0], says))
+
+    def _scene(self, points: Mapping[str, Point], name: str) -> tuple[str, dict[str, str]] | None:
+        """Return the file and the settings of a combination's scene; None if it is wrong, which is told once."""
+        sets = dict(self.file.sets)
+        for point in points.values():
+            sets.update(point.sets)
+        key = json.dumps(sets, sort_keys=True)
+        if key not in self._scenes:
+            try:
+                self._scenes[key] = self._resolved(sets)
+            except InputError as error:
+                self._scenes[key] = None
+                self._tell(str(error), points, name)
+        return self._scenes[key]
+
+    def _resolved(self, sets: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+        data = copy.deepcopy(self._base)
+        for key, value in sets.items():
+            apply_set(data, f"{key}={value}")
+        scene = scene_from_dict(data, self.file.scene.parent)
+        names = self._copied(mesh_files(scene))
+        text = dump_scene(scene, names)
+        name = f"scene-{hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]}.toml"
+        self.plan.files[name] = text.encode()
+        return f"{INPUTS}/{name}", {".".join(key): as_toml(value) for key, value in _leaves(tomllib.loads(text))}
+
+    def _copied(self, meshes: list[MeshFile]) -> dict[str, str]:
+        """Return new names of mesh files by their paths; files that belong together stay in a folder of their own."""
+        folders: dict[str, list[MeshFile]] = {}
+        for mesh in meshes:
+            folders.setdefault(os.path.dirname(mesh.mark.file), []).append(mesh)
+        names = {}
+        for together in folders.values():
+            digests = json.dumps([mesh.mark.blake2b for mesh in together])
+            folder = f"meshes/{hashlib.sha256(digests.encode()).hexdigest()[:_DIGITS]}"
+            for mesh in together:
+                names[os.path.abspath(mesh.source)] = f"{folder}/{mesh.source.name}"
+                self.plan.meshes[f"{folder}/{mesh.source.name}"] = mesh.source
+        return names
+
+    def _chosen(self, points: Mapping[str, Point], name: str) -> tuple[list[str], dict[str, str]] | None:
+        """Return the words of a combination's options, and by ``-name`` what they are; None if they are wrong."""
+        file = next((point.options_file for point in points.values() if point.options_file), "")
+        given = {option: value for point in points.values() for option, value in point.options.items()}
+        key = json.dumps([file, sorted(given.items())])
+        if key not in self._options:
+            try:
+                self._options[key] = self._read_options(file, given)
+            except InputError as error:
+                self._options[key] = None
+                self._tell(str(error), points, name)
+        return self._options[key]
+
+    def _read_options(self, file: str, given: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
+        words, says = [], {f"-{option}": value for option, value in given.items()}
+        over = [word for option, value in given.items() for word in (f"-{option}", value) if word]
+        if file:
+            beside = self.file.path.parent / file
+            named = file if os.path.basename(file) == file and not beside.exists() else str(beside)
+            read = options.from_file(named)
+            options.resolve([f"-{options.FILE}", named, *over], {})
+            own = bool(read) and all(option.shipped for option in read)
+            if not own:
+                says |= {f"{named_as(file)}: -{option.name}": option.value for option in read}
+            words = [f"-{options.FILE}", os.path.basename(file) if own else self._own_file(file, read)]
+            says[f"-{options.FILE}"] = os.path.basename(file)
+        else:
+            options.resolve(over, {})
+        return [*words, *over], says
+
+    def _own_file(self, file: str, read: list[options.Option]) -> str:
+        """Return the name of a copy of an options file that needs none beside it but petfsi's own."""
+        lines: list[str] = []
+        for option in read:
+            value = f'"{option.value}"' if " " in option.value else option.value
+            line = f"-{options.FILE} {option.origin}" if option.shipped else f"-{option.name} {value}".rstrip()
+            if not (option.shipped and lines and lines[-1] == line):
+                lines.append(line)
+        text = "\n".join(lines) + "\n"
+        stem = Path(file).stem
+        name = f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]}.opts"
+        self.plan.files[name] = text.encode()
+        return name
+
+    def _tell(self, text: str, points: Mapping[str, Point], name: str) -> None:
+        """Add what is wrong with a combination; what is wrong with all of them is told once."""
+        first, *rest = text.split("\n")
+        for line in rest or [first]:
+            line = line.strip()
+            if not any(line in told for told in self.mistakes):
+                self.mistakes.append(f"run {name}: {line}" if points else line)
+
+
+def named_as(file: str) -> str:
+    """Return an options file's name without its folder: where it is does not change a run."""
+    return os.path.basename(file)
+
+
+def _combinations(file: SweepFile) -> Iterator[dict[str, Point]]:
+    for points in itertools.product(*file.axes.values()):
+        chosen = dict(zip(file.axes, points, strict=True))
+        if not file.excludes(chosen):
+            yield chosen
+
+
+def _leaves(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, value in table.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*path, name))
+        else:
+            yield (*path, name), value

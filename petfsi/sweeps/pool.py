@@ -1,0 +1,260 @@
+"""The runs of a sweep on the cores of this machine: as many ranks at a time as there are."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from types import FrameType
+
+from petfsi.runs.failure import NO_ROOM
+from petfsi.sweeps import attempts
+from petfsi.sweeps.claim import claim, give_back, is_busy
+from petfsi.sweeps.folder import SweepFolder
+from petfsi.sweeps.launch import start
+from petfsi.sweeps.plan import Planned
+from petfsi.sweeps.states import RESULTS, Look, look_at
+
+#: Bytes that must be free on the disk for a run to start.
+LEAST_ROOM = 100_000_000
+#: Seconds between two looks at processes of one's own, and at runs at which others are.
+POLL, LOOK = 0.02, 0.5
+#: Seconds that ranks have to end once mpirun is told to end them.
+PATIENCE = 5.0
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass
+class _Child:
+    run: Planned
+    process: subprocess.Popen[bytes]
+    claim: int
+    step: int
+    began: float
+    told: bool = False
+
+
+class Pool:
+    """Runs what has no result yet. ``work`` returns why it stopped before all had one, or nothing.
+
+    Runs are taken in rounds of ``repeat``, those of many ranks first. What another process is at is waited for, and
+    what it leaves is taken over; its ranks count among those at work.
+
+    Parameters
+    ----------
+    folder : SweepFolder
+    runs : sequence of Planned
+    cores : int
+        Ranks at a time; a run of more has the machine to itself.
+    say : callable
+    """
+
+    def __init__(self, folder: SweepFolder, runs: Sequence[Planned], cores: int, say: Callable[[str], None]) -> None:
+        self.folder, self.cores, self.say = folder, cores, say
+        self.waiting = sorted(runs, key=lambda run: (run.repeat, -run.ranks))
+        self.total, self.ended = len(runs), 0
+        self.children: list[_Child] = []
+        self.others: list[Planned] = []
+        self.why = ""
+        self._signals: list[int] = []
+        self._looked = 0.0
+
+    def work(self) -> str:
+        """Run until nothing is left to be run, or until told to stop."""
+        with self._hearing():
+            try:
+                self._loop()
+            finally:
+                self._end()
+        if self.others and self.why:
+            names = ", ".join(run.name for run in self.others[:5])
+            self.say(f"at work already, and not stopped by this: {names}{' ...' * (len(self.others) > 5)}")
+        return self.why
+
+    def _loop(self) -> None:
+        while True:
+            self._reap()
+            self._heed()
+            if not self.why:
+                self._look_at_others()
+                self._start()
+            if not self.children and (self.why or not (self.waiting or self.others)):
+                return
+            time.sleep(POLL)
+
+    # ---- starting -----------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        """Start what there are cores for, in order."""
+        free = self.cores - sum(child.run.ranks for child in self.children) - sum(run.ranks for run in self.others)
+        left: list[Planned] = []
+        for n, run in enumerate(self.waiting):
+            alone = not self.children and not self.others
+            if free < 1 and not alone:
+                left += self.waiting[n:]
+                break
+            if run.ranks > free and not alone:
+                left.append(run)
+                continue
+            free -= self._take(run)
+            if self.why:
+                left += self.waiting[n + 1 :]
+                break
+        self.waiting = left
+
+    def _take(self, run: Planned) -> int:
+        """Start a run if it has no result and nobody is at it; return how many cores that takes."""
+        path = self.folder.run(run.name)
+        handle = claim(path)
+        if handle is None:
+            self.say(f"{run.name}: another process is at it")
+            self.others.append(run)
+            return run.ranks
+        child = None
+        try:
+            with self._room():
+                child = self._begin(run, handle)
+        finally:
+            if child is None:
+                give_back(handle)
+        return 0 if child is None else run.ranks
+
+    def _begin(self, run: Planned, handle: int) -> _Child | None:
+        """Start a run that is claimed; None if there is nothing to run, or no room."""
+        path = self.folder.run(run.name)
+        look = look_at(path, run, busy=False)
+        if look.state in (*RESULTS, "lost", "refused"):
+            self.ended += 1
+            return None
+        if shutil.disk_usage(path).free < LEAST_ROOM:
+            self._stop(self._no_room())
+            return None
+        attempts.began(path, "run" if look.step < 0 else "resume", look.step)
+        process = start(self.folder, run, look.step, self.cores, handle)
+        self.children.append(_Child(run, process, handle, look.step, time.monotonic()))
+        return self.children[-1]
+
+    def _look_at_others(self) -> None:
+        """Take back what others have left."""
+        if not self.others or time.monotonic() - self._looked < LOOK:
+            return
+        self._looked = time.monotonic()
+        left = [run for run in self.others if not is_busy(self.folder.run(run.name))]
+        self.others = [run for run in self.others if run not in left]
+        self.waiting = [*left, *self.waiting]
+
+    # ---- ending -------------------------------------------------------------------------------------------------
+
+    def _reap(self) -> None:
+        """Note which processes have ended, and how."""
+        for child in list(self.children):
+            pid, status, usage = os.wait4(child.process.pid, os.WNOHANG)
+            if pid == 0:
+                continue
+            code = child.process.returncode = os.waitstatus_to_exitcode(status)
+            self.children.remove(child)
+            try:
+                with self._room():
+                    self._note(child, code, usage.ru_maxrss)
+            finally:
+                give_back(child.claim)
+
+    def _note(self, child: _Child, code: int, peak_kb: int) -> None:
+        path, seconds = self.folder.run(child.run.name), time.monotonic() - child.began
+        look = look_at(path, child.run, busy=False)
+        full = look.state == "broken" and look.kind == "disk"
+        gained = max(0, look.step) - max(0, child.step)
+        attempts.ended(path, code, seconds, gained, child.told or full, peak_kb)
+        look = look_at(path, child.run, busy=False)  # with what is now known of its end
+        if full:
+            self._stop(f"{child.run.name}: {look.reason}; {self._no_room()}")
+        if look.state == "broken" and not self.why:
+            self.waiting.insert(0, child.run)
+        else:
+            self.ended += 1
+        self.say(f"[{self.ended}/{self.total}] {child.run.name}: {_story(look, seconds)}")
+
+    def _heed(self) -> None:
+        """Do what signals ask for: the first stops all runs after their present step, the second ends them."""
+        if self._signals and not self.why:
+            self._stop(signal.Signals(self._signals[0]).name)
+        elif len(self._signals) > 1:
+            self._end()
+
+    def _stop(self, why: str) -> None:
+        """Let every run end after its present step, and start no other."""
+        self.why = self.why or why
+        for child in self.children:
+            if not child.told:
+                child.told = True
+                with suppress(ProcessLookupError):
+                    child.process.send_signal(signal.SIGUSR1)
+        if self.children:
+            self.say(f"{len(self.children)} at work stop after their present steps; a second signal ends them at once")
+
+    def _end(self) -> None:
+        """End every process: mpirun is told to, as its ranks are not in its group."""
+        for child in self.children:
+            child.told = True
+            with suppress(ProcessLookupError):
+                if child.run.ranks > 1:
+                    child.process.terminate()
+                else:
+                    os.killpg(child.process.pid, signal.SIGKILL)
+        limit = time.monotonic() + PATIENCE
+        while self.children and time.monotonic() < limit:
+            with suppress(OSError):
+                self._reap()
+            time.sleep(POLL)
+        for child in self.children:
+            with suppress(ProcessLookupError):
+                os.killpg(child.process.pid, signal.SIGKILL)
+        while self.children:
+            with suppress(OSError):
+                self._reap()
+            time.sleep(POLL)
+
+    @contextmanager
+    def _room(self) -> Iterator[None]:
+        """Stop, instead of failing, when what is done inside finds the disk full."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+            self._stop(self._no_room())
+
+    def _no_room(self) -> str:
+        free = shutil.disk_usage(self.folder.path).free
+        return (
+            f"{free / 1e9:.3g} GB are free on the disk of {self.folder.path}, and the sweep goes on once there is more"
+        )
+
+    @contextmanager
+    def _hearing(self) -> Iterator[None]:
+        """Hear signals; one that was ignored before, as by nohup, stays so."""
+
+        def hear(number: int, _frame: FrameType | None) -> None:
+            self._signals.append(number)
+
+        before = {number: signal.getsignal(number) for number in SIGNALS}
+        for number, handler in before.items():
+            if handler != signal.SIG_IGN:
+                signal.signal(number, hear)
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _story(look: Look, seconds: float) -> str:
+    steps = look.summary.get("steps")
+    took = f", {steps} steps" if isinstance(steps, int) else ""
+    reason = f": {look.reason}" if look.reason else ""
+    return f"{look.state}{took}, {seconds:.3g} s{reason}"

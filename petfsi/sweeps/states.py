@@ -1,0 +1,125 @@
+"""What became of a run, as its directory tells: nothing else is remembered of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from petfsi.runs.failure import NO_RESULT
+from petfsi.sweeps.attempts import Attempt, read_attempts
+from petfsi.sweeps.claim import is_busy
+from petfsi.sweeps.folder import OUTPUT, known
+from petfsi.sweeps.plan import Planned
+
+#: In the order of their telling. A failed run is a result: the same scene and options will fail again.
+STATES = ("done", "failed", "running", "new", "stopped", "broken", "lost", "refused")
+RESULTS = ("done", "failed")
+#: So many attempts without a step gained are enough.
+MOST_ATTEMPTS = 3
+REFUSED, FAILED = 2, 3
+
+
+@dataclass
+class Look:
+    """What a run's directory tells.
+
+    Attributes
+    ----------
+    state : str
+        One of ``STATES``.
+    reason : str
+        Why it stopped, failed, was refused or lost.
+    step : int
+        Of the newest checkpoint, -1 if there is none.
+    kind : str
+        Of a failure.
+    summary : dict
+        As far as there is one.
+    attempts : list of Attempt
+    """
+
+    state: str
+    reason: str
+    step: int
+    kind: str = ""
+    summary: dict[str, Any] = field(default_factory=dict)
+    attempts: list[Attempt] = field(default_factory=list)
+
+
+def look_at(path: Path, run: Planned, busy: bool | None = None) -> Look:
+    """Return what has become of a run.
+
+    Parameters
+    ----------
+    path : Path
+        Its directory.
+    run : Planned
+    busy : bool, optional
+        Whether it is at work, where that is known: whoever claims a run knows.
+    """
+    attempts, summary, step = read_attempts(path), known(path / "summary.json"), newest_step(path)
+    failure = summary.get("failure")
+    kind = str(failure.get("kind", "")) if isinstance(failure, dict) else ""
+    found = Look("new", "", step, kind, summary, attempts)
+    if is_busy(path) if busy is None else busy:
+        found.state = "running"
+        return found
+    found.state, found.reason = _ended(path, run, summary, kind, attempts)
+    if found.state == "broken" and is_lost(attempts, step):
+        found.state = "lost"
+        found.reason = f"{MOST_ATTEMPTS} attempts gained no step: {found.reason}"
+    return found
+
+
+def newest_step(path: Path) -> int:
+    """Return the step of a run's newest checkpoint, -1 if there is none."""
+    names = [one.stem for one in (path / "checkpoint").glob("*.json")]
+    return max((int(name) for name in names if name.isascii() and name.isdigit()), default=-1)
+
+
+def is_lost(attempts: list[Attempt], step: int) -> bool:
+    """Return whether the last attempts, those not counted that were told to stop, have gained nothing."""
+    last = [attempt for attempt in attempts if not attempt.told][-MOST_ATTEMPTS:]
+    return len(last) == MOST_ATTEMPTS and all(attempt.step >= step for attempt in last)
+
+
+def _ended(path: Path, run: Planned, summary: dict[str, Any], kind: str, attempts: list[Attempt]) -> tuple[str, str]:
+    """Return state and reason of a run at which nobody is at work."""
+    status, reason = summary.get("status"), str(summary.get("reason", ""))
+    steps, last = summary.get("steps"), attempts[-1].exit if attempts else None
+    enough = run.steps is not None and isinstance(steps, int) and steps >= run.steps
+    if status == "done" or (status == "stopped" and enough):
+        return "done", ""
+    if status == "failed" and kind not in NO_RESULT:
+        return "failed", reason
+    if last == REFUSED:
+        return "refused", last_words(path)
+    if status == "failed":
+        return "broken", f"{kind}: {reason}"
+    if status == "stopped":
+        return "stopped", reason
+    if not attempts and not summary:
+        return "new", ""
+    if last == FAILED and not summary:  # before there was anything to write down
+        return "failed", last_words(path)
+    return "broken", _how(last) if status == "running" or not summary else "summary.json is damaged"
+
+
+def _how(code: int | None) -> str:
+    if code is None:
+        return "its process has gone"
+    return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def last_words(path: Path) -> str:
+    """Return what a run said last, from its last message on."""
+    try:
+        with open(path / OUTPUT, "rb") as file:
+            file.seek(max(0, file.seek(0, 2) - 4000))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    begins = [n for n, line in enumerate(lines) if line.startswith("petfsi: ")]
+    said = lines[begins[-1] :] if begins else lines[-1:]
+    return "; ".join(line.removeprefix("petfsi: ").strip() for line in said[:8])
