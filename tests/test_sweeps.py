@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 from processes import environment
 
 import petfsi
+from petfsi.output.mesh_files import mesh_files
+from petfsi.scene.load import load_scene
 from petfsi.sweeps import launch, pool
 from petfsi.sweeps.attempts import again, began, ended
 from petfsi.sweeps.folder import SweepFolder
@@ -194,6 +196,42 @@ def test_a_plan_multiplies_axes_and_leaves_out_what_is_excluded(place):
     assert run.says["time.end"] == "0.1" and run.says["time.dt"] == "0.02" and run.says["-options_file"] == "own.opts"
     assert plan.files[run.options[1]] == b"-options_file split.opts\n-fsi_fieldsplit_pressure_ksp_rtol 1e-5\n"
     assert plan_sweep(Path("s.toml")).runs == plan.runs
+
+
+def test_a_folder_needs_nothing_outside_itself(place):
+    Path("far").mkdir()
+    Path("far/block.node").write_text("points")
+    Path("far/block.ele").write_text("cells")
+    body = 'shape = { mesh = "far/block.node" }'
+    Path("scene.toml").write_text(re.sub("shape = .*", body, SCENE))
+    written("a", "b")
+    SweepFolder(Path("out")).make(plan_sweep(Path("s.toml")))
+    for path in ("far/block.node", "far/block.ele", "scene.toml", "s.toml"):
+        Path(path).unlink()
+    os.rename("out", "moved")
+    first, second = SweepFolder.open(Path("moved")).planned()
+    assert first.scene == second.scene and first.says["solids.block.shape.mesh"].startswith('"meshes/')
+    found = mesh_files(load_scene(Path("moved", first.scene)))
+    assert [(one.source.name, one.source.read_text()) for one in found] == [
+        ("block.node", "points"),
+        ("block.ele", "cells"),
+    ]
+
+
+def test_words_of_a_start(place):
+    written("a", text="steps = 7")
+    folder, run = SweepFolder(Path("out")), plan_sweep(Path("s.toml")).runs[0]
+    folder.make(plan_sweep(Path("s.toml")))
+    directory = os.path.abspath("out/runs/how-a")
+    begin = ["run", os.path.abspath(f"out/{run.scene}"), "--out", directory]
+    assert launch.run_words(folder, run, -1) == [*begin, "--steps", "7"]
+    Path(directory, ".petfsi-run").touch()
+    assert launch.run_words(folder, run, -1) == [*begin, "--overwrite", "--steps", "7"]
+    assert launch.run_words(folder, run, 3) == ["resume", directory, "--steps", "4"]
+    assert launch.launcher(3, cores=2) == ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", "3"]
+    env = {"OMPI_COMM_WORLD_RANK": "0", "PMIX_RANK": "0", "OMPI_MCA_btl": "self", "PETSC_OPTIONS": "-x", "HOME": "/"}
+    kept = {"OMPI_MCA_btl": "self", "HOME": "/", "OMP_NUM_THREADS": "1", "OMPI_MCA_odls_base_sigkill_timeout": "1"}
+    assert launch.environment(env) == kept
 
 
 # ---- states -------------------------------------------------------------------------------------------------
@@ -392,7 +430,7 @@ def test_a_driver_that_is_killed_leaves_runs_that_the_next_one_waits_for(place, 
         wait_for(lambda: checkpoints("how-slow1") and checkpoints("how-slow2"))
         process.kill()
     done = sweep("out", "--jobs", "2")
-    assert done.returncode == 0 and "how-slow1: another process is at it" in done.stdout
+    assert done.returncode == 0 and "how-slow1: another process has claimed it" in done.stdout
     assert starts() == {f"how-{name} run": 1 for name in SLOW} and set(states().values()) == {"done"}
 
 
@@ -425,16 +463,16 @@ dt = 0.025
 @pytest.mark.launches
 def test_real_runs_come_to_an_end_and_can_be_read(place, here):
     Path("s.toml").write_text(REAL)
-    done = here("sweep", "s.toml", "--out", "runs/sweep-solvers")
+    done = here("sweep", "s.toml", "--out", "runs/solvers")
     assert done.returncode == 0, done.stdout + done.stderr
-    found = rows("runs/sweep-solvers")
+    found = rows("runs/solvers")
     assert [row["state"] for row in found.values()] == ["done", "done", "failed", "failed", "done"]
     fails, two = found["case-fails_dt-0.05"], found["case-two_dt-0.05"]
     assert fails["kind"] == "scene" and fails["steps"] == "2" and "it must be finite" in fails["reason"]
     assert two["ranks"] == "2" and float(two["wall_s"]) > 0 and float(two["peak_mb"]) > 50 and two["version.petsc"]
-    told = json.loads(Path("runs/sweep-solvers/runs/case-two_dt-0.05/summary.json").read_text())
+    told = json.loads(Path("runs/solvers/runs/case-two_dt-0.05/summary.json").read_text())
     assert told["ranks"] == 2 and told["status"] == "done"
-    again = here("sweep", "runs/sweep-solvers")
+    again = here("sweep", "runs/solvers")
     assert again.returncode == 0 and "[" not in again.stdout
     # as README says it
     example = re.search(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)[1]
@@ -447,5 +485,5 @@ def test_real_runs_come_to_an_end_and_can_be_read(place, here):
 
 
 def test_the_shipped_sweep_is_sound(place, here):
-    done = here("sweep", ROOT / "jobs" / "sweep-solvers.toml", "--dry-run")
-    assert done.returncode == 0 and "7 runs in runs/sweep-solvers: 7 new" in done.stdout, done.stderr
+    done = here("sweep", ROOT / "jobs" / "sweeps" / "solvers.toml", "--dry-run")
+    assert done.returncode == 0 and "7 runs in runs/solvers: 7 new" in done.stdout, done.stderr

@@ -28,7 +28,7 @@ def claim(path: Path) -> int | None:
         except BlockingIOError:
             time.sleep(0.005)
             continue
-        if not works(path):
+        if not at_work(path):
             return handle
         break
     os.close(handle)
@@ -46,20 +46,20 @@ def is_busy(path: Path) -> bool:
     try:
         handle = os.open(path / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:
-        return works(path)
+        return bool(at_work(path))
     try:
         fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     finally:
         os.close(handle)
-    return works(path)
+    return bool(at_work(path))
 
 
-def works(path: Path) -> bool:
-    """Return whether a process holds the lock of a run's directory."""
+def at_work(path: Path) -> str:
+    """Return which process holds the lock of a run's directory, in words; nothing if none does."""
     try:
         refuse_if_held(path)
-    except InputError:
-        return True
-    return False
+    except InputError as error:
+        return str(error).partition(": ")[2]
+    return ""

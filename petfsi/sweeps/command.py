@@ -84,6 +84,8 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
         return DONE
     if wanted.retry in ("failed", "lost", "refused"):
         _retry(folder, chosen, wanted.retry, say)
+    if os.environ.get("PETSC_OPTIONS"):
+        say("PETSC_OPTIONS is set, and not read: what a run hangs on stands in the sweep's file")
     cores = wanted.jobs or len(os.sched_getaffinity(0))
     why = Pool(folder, chosen, cores, say).work()
     _say_states(folder, runs, chosen, say)

@@ -14,7 +14,7 @@ from types import FrameType
 
 from petfsi.runs.failure import NO_ROOM
 from petfsi.sweeps import attempts
-from petfsi.sweeps.claim import claim, give_back, is_busy
+from petfsi.sweeps.claim import at_work, claim, give_back, is_busy
 from petfsi.sweeps.folder import SweepFolder
 from petfsi.sweeps.launch import start
 from petfsi.sweeps.plan import Planned
@@ -62,6 +62,7 @@ class Pool:
         self.others: list[Planned] = []
         self.why = ""
         self._signals: list[int] = []
+        self._heeded = 0
         self._looked = 0.0
 
     def work(self) -> str:
@@ -112,7 +113,7 @@ class Pool:
         path = self.folder.run(run.name)
         handle = claim(path)
         if handle is None:
-            self.say(f"{run.name}: another process is at it")
+            self.say(f"{run.name}: {at_work(path) or 'another process has claimed it'}")
             self.others.append(run)
             return run.ranks
         child = None
@@ -183,12 +184,12 @@ class Pool:
         """Do what signals ask for: the first stops all runs after their present step, the second ends them."""
         if self._signals and not self.why:
             self._stop(signal.Signals(self._signals[0]).name)
-        elif len(self._signals) > 1:
+        elif len(self._signals) > self._heeded:
             self._end()
 
     def _stop(self, why: str) -> None:
         """Let every run end after its present step, and start no other."""
-        self.why = self.why or why
+        self.why, self._heeded = self.why or why, len(self._signals)
         for child in self.children:
             if not child.told:
                 child.told = True

@@ -8,7 +8,7 @@ from typing import Any
 
 from petfsi.runs.failure import NO_RESULT
 from petfsi.sweeps.attempts import Attempt, read_attempts
-from petfsi.sweeps.claim import is_busy
+from petfsi.sweeps.claim import at_work, is_busy
 from petfsi.sweeps.folder import OUTPUT, known
 from petfsi.sweeps.plan import Planned
 
@@ -63,7 +63,7 @@ def look_at(path: Path, run: Planned, busy: bool | None = None) -> Look:
     kind = str(failure.get("kind", "")) if isinstance(failure, dict) else ""
     found = Look("new", "", step, kind, summary, attempts)
     if is_busy(path) if busy is None else busy:
-        found.state = "running"
+        found.state, found.reason = "running", at_work(path)
         return found
     found.state, found.reason = _ended(path, run, summary, kind, attempts)
     if found.state == "broken" and is_lost(attempts, step):

@@ -45,7 +45,7 @@ def row_of(run: Planned, look: Look) -> dict[str, Any]:
         "iterations_mean": iterations.get("mean"),
         "iterations_max": iterations.get("max"),
         "wall_s": told.get("wall_s"),
-        "peak_mb": round(peak / 1e3, 1) if peak else None,
+        "peak_mb": round(peak * 1024 / 1e6, 1) if peak else None,
         "attempts": len(look.attempts),
     }
     row |= {f"seconds.{phase}": value for phase, value in _table(told, "phases").items()}
