@@ -298,6 +298,21 @@ def test_a_claim_is_running_and_three_attempts_count_from_the_last_retry(made):
     assert look_at(path, run).state == "broken"  # it got further
 
 
+def test_a_lock_of_another_machine_is_left_alone_and_takes_no_core(sweep):
+    sweep(written("fine", "other"), "--out", "out", "--only", "how=fine")
+    path = Path("out/runs/how-other")
+    holder = {"host": "elsewhere", "boot": "1", "pid": 7, "started": 1, "user": "me", "since": "now"}
+    (path / ".lock").write_text(json.dumps(holder))
+    done = sweep("out", "--status")
+    assert "how-other: running: another process is at work in it: process 7 of me on elsewhere" in done.stdout
+    with driver("out", "--jobs", 1) as process:
+        wait_for(lambda: "process 7 of me on elsewhere" in process.stdout.readline())
+        assert not starts()["how-other run"]
+        (path / ".lock").unlink()
+        process.communicate(timeout=30)
+    assert process.returncode == 0 and starts()["how-other run"] == 1
+
+
 # ---- to the end ---------------------------------------------------------------------------------------------
 
 
@@ -436,9 +451,8 @@ def test_a_driver_that_is_killed_leaves_runs_that_the_next_one_waits_for(place, 
 
 def test_two_drivers_share_the_runs(place):
     names = [f"slow{n}" for n in range(4)]
-    written(*names)
-    SweepFolder(Path("out")).make(plan_sweep(Path("s.toml")))
-    with driver("out", "--jobs", 2) as one, driver("out", "--jobs", 2) as two:
+    file = written(*names)
+    with driver(file, "--out", "out", "--jobs", 2) as one, driver(file, "--out", "out", "--jobs", 2) as two:
         said = [process.communicate(timeout=60)[0] for process in (one, two)]
     assert (one.returncode, two.returncode) == (0, 0), said
     assert starts() == {f"how-{name} run": 1 for name in names} and set(states().values()) == {"done"}

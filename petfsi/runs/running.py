@@ -55,6 +55,7 @@ class Run:
         self.probes: dict[str, float] = {}
         self._saved: int | None = None
         self._row = -1
+        self._taking = simulation.step
         self._slowest = self._writing = 0.0
 
     def open(self, after: int | None = None) -> None:
@@ -99,10 +100,9 @@ class Run:
 
     def _failure(self, error: BaseException) -> dict[str, Any]:
         """Return what the summary says of a failure. Not collective."""
-        step = 1 + max(self._row, -1 if self._saved is None else self._saved)
         newest = max(self.files.checkpoints.glob("*.h5"), default=None)
         where = "" if newest is None else str(newest.relative_to(self.files.path))
-        return describe_failure(error, step, self.simulation.time, where)
+        return describe_failure(error, self._taking, self.simulation.time, where)
 
     def loop(self, steps: int | None, stop: Stop) -> int:
         """Step until the scene's end, or ``steps`` times, or until told to stop; return the exit status. Collective."""
@@ -147,6 +147,7 @@ class Run:
             On all ranks; what is wrong with the scene only now has become the step's failure.
         """
         simulation = self.simulation
+        self._taking = simulation.step + 1
         before = None if self._saved == simulation.step else Kept.of(simulation)
         try:
             self.advance()

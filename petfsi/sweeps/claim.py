@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 
 from petfsi.errors import InputError
-from petfsi.output.lock import refuse_if_held
+from petfsi.output.lock import NAME as LOCK
+from petfsi.output.lock import Holder, refuse_if_held
 
 NAME = ".claim"
 #: How often a claim is tried: who only looks whether there is one holds it for a moment.
@@ -28,7 +29,8 @@ def claim(path: Path) -> int | None:
         except BlockingIOError:
             time.sleep(0.005)
             continue
-        if not at_work(path):
+        # a run that is put aside has taken its claim along
+        if os.path.samestat(os.fstat(handle), os.stat(path / NAME)) and not at_work(path):
             return handle
         break
     os.close(handle)
@@ -54,6 +56,15 @@ def is_busy(path: Path) -> bool:
     finally:
         os.close(handle)
     return bool(at_work(path))
+
+
+def is_elsewhere(path: Path) -> bool:
+    """Return whether the lock of a run's directory is that of a process on another machine."""
+    try:
+        holder = Holder.read((path / LOCK).read_bytes())
+    except OSError:
+        return False
+    return holder is not None and not holder.here
 
 
 def at_work(path: Path) -> str:

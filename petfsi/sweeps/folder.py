@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from petfsi.sweeps.plan import INPUTS, Plan, Planned
 
 #: Marks a folder as a sweep's.
 MARKER, FORMAT = ".petfsi-sweep", 1
+#: Locked while the sweep's own files are written.
+WRITING = ".writing"
 #: In a run's directory: which run of a sweep it is, and what it printed.
 RUN, OUTPUT = "run.json", "output.txt"
 RUNS, REPLACED = "runs", "replaced"
@@ -79,7 +82,9 @@ class SweepFolder:
         """Raise InputError unless a sweep is here, or can be; writes nothing."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"sweep folder {self.path}: there is a file of that name")
-        if self.path.is_dir() and not self.is_sweep() and any(self.path.iterdir()):
+        there = [path.name for path in self.path.iterdir()] if self.path.is_dir() else []
+        # another call may be making one: its marker comes before all else
+        if any(name != WRITING and not name.startswith(MARKER) for name in there) and not self.is_sweep():
             raise InputError(f"sweep folder {self.path} is not empty and holds no sweep; name another with --out")
 
     # ---- what is to be ------------------------------------------------------------------------------------------
@@ -134,12 +139,25 @@ class SweepFolder:
         there = sorted(path.parent.name for path in (self.path / RUNS).glob(f"*/{RUN}"))
         return [name for name in there if name not in known]
 
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other calls from writing what is the sweep's own while this one does."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        with open(self.path / WRITING, "wb") as file:
+            with suppress(OSError):  # where the file system knows no locks there is one call at a time, it is hoped
+                fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
     def make(self, plan: Plan) -> None:
         """Write all that runs start from; what is here stays. The plan is last: what was cut short has none."""
-        self.inputs.mkdir(parents=True, exist_ok=True)
+        with self.alone():
+            self._make(plan)
+
+    def _make(self, plan: Plan) -> None:
         marker = {"petfsi": petfsi.__version__, "format": FORMAT}
         if not self.is_sweep():
             files.replace_text(self.path / MARKER, json.dumps(marker) + "\n")
+        self.inputs.mkdir(exist_ok=True)
         for name, source in plan.meshes.items():
             target = self.inputs / name
             if not target.exists():

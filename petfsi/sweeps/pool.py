@@ -14,7 +14,7 @@ from types import FrameType
 
 from petfsi.runs.failure import NO_ROOM
 from petfsi.sweeps import attempts
-from petfsi.sweeps.claim import at_work, claim, give_back, is_busy
+from petfsi.sweeps.claim import at_work, claim, give_back, is_busy, is_elsewhere
 from petfsi.sweeps.folder import SweepFolder
 from petfsi.sweeps.launch import start
 from petfsi.sweeps.plan import Planned
@@ -23,7 +23,7 @@ from petfsi.sweeps.states import RESULTS, Look, look_at
 #: Bytes that must be free on the disk for a run to start.
 LEAST_ROOM = 100_000_000
 #: Seconds between two looks at processes of one's own, and at runs at which others are.
-POLL, LOOK = 0.02, 0.5
+POLL, LOOK = 0.01, 0.5
 #: Seconds that ranks have to end once mpirun is told to end them.
 PATIENCE = 5.0
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -92,20 +92,17 @@ class Pool:
 
     def _start(self) -> None:
         """Start what there are cores for, in order."""
-        free = self.cores - sum(child.run.ranks for child in self.children) - sum(run.ranks for run in self.others)
+        others = sum(run.ranks for run in self.others if not is_elsewhere(self.folder.run(run.name)))
+        free = self.cores - sum(child.run.ranks for child in self.children) - others
         left: list[Planned] = []
         for n, run in enumerate(self.waiting):
-            alone = not self.children and not self.others
-            if free < 1 and not alone:
+            if self.why or free < 1:
                 left += self.waiting[n:]
                 break
-            if run.ranks > free and not alone:
+            if run.ranks > free and free < self.cores:  # one of more ranks than cores waits until nothing is at work
                 left.append(run)
-                continue
-            free -= self._take(run)
-            if self.why:
-                left += self.waiting[n + 1 :]
-                break
+            else:
+                free -= self._take(run)
         self.waiting = left
 
     def _take(self, run: Planned) -> int:
@@ -115,7 +112,7 @@ class Pool:
         if handle is None:
             self.say(f"{run.name}: {at_work(path) or 'another process has claimed it'}")
             self.others.append(run)
-            return run.ranks
+            return 0 if is_elsewhere(path) else run.ranks
         child = None
         try:
             with self._room():
@@ -233,7 +230,7 @@ class Pool:
     def _no_room(self) -> str:
         free = shutil.disk_usage(self.folder.path).free
         return (
-            f"{free / 1e9:.3g} GB are free on the disk of {self.folder.path}, and the sweep goes on once there is more"
+            f"{free / 1e6:,.0f} MB are free on the disk of {self.folder.path}, and the sweep goes on once there is more"
         )
 
     @contextmanager

@@ -103,13 +103,13 @@ def _ended(path: Path, run: Planned, summary: dict[str, Any], kind: str, attempt
         return "new", ""
     if last == FAILED and not summary:  # before there was anything to write down
         return "failed", last_words(path)
-    return "broken", _how(last) if status == "running" or not summary else "summary.json is damaged"
+    return "broken", _how(path, last) if status == "running" or not summary else "summary.json is damaged"
 
 
-def _how(code: int | None) -> str:
+def _how(path: Path, code: int | None) -> str:
     if code is None:
         return "its process has gone"
-    return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+    return f"killed by signal {-code}" if code < 0 else f"exit code {code}: {last_words(path)}"
 
 
 def last_words(path: Path) -> str:

@@ -21,7 +21,8 @@ FIXED += ["iterations_mean", "iterations_max", "wall_s", "peak_mb", "attempts"]
 def collect(folder: SweepFolder, runs: Sequence[Planned]) -> list[dict[str, Any]]:
     """Write ``runs.csv``, and return its rows."""
     rows = [row_of(run, look_at(folder.run(run.name), run)) for run in runs]
-    files.replace_text(folder.table, table_text(rows))
+    with folder.alone():
+        files.replace_text(folder.table, table_text(rows))
     return rows
 
 
