@@ -23,9 +23,10 @@ from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 from petfsi.solving import start
 from petfsi.solving.balance import Balance
+from petfsi.solving.convergence import Outcome
 from petfsi.solving.diagonal import DiagonalSolver
 from petfsi.solving.regions import ClosedRegions
-from petfsi.solving.solver import Outcome, Solver
+from petfsi.solving.solver import Solver
 from petfsi.solving.splitting import SplitWatch
 from petfsi.solving.system import System
 from petfsi.substeps import StableStep

@@ -28,7 +28,7 @@ from petfsi.bench.report import Report, Row
 from petfsi.errors import SolveError
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving.solver import only_options
+from petfsi.solving.option_database import only_options
 
 PAPER = "monolithic-paper.opts"
 TOLERANCE = 1e-8
