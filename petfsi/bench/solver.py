@@ -148,7 +148,7 @@ def _start(sim: Simulation) -> None:
         field.predict(sim.time, sim.dt)
     for coupling in sim.couplings:
         coupling.couple(sim.time, sim.dt)
-    sim._assemble(sim.time, sim.dt)
+    sim.equations.assemble(sim.time, sim.dt)
     if sim.solid is not None:  # nothing but round-off, yet of a stiff bar more than the flow
         sim.system.rhs.array[sim.system.piece("solid")] = 0.0
 
