@@ -228,13 +228,13 @@ def test_a_shell_sees_the_exit_code(scene):
 
 TOGETHER = """
 import sys
-from petfsi import cli
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.solid import SimplexSolid
-cli.AGREE_SECONDS = {patience}
+from petfsi.runs import ending
+ending.AGREE_SECONDS = {patience}
 def work(comm):
     {body}
-sys.exit(cli._together(work))
+sys.exit(ending.together(work))
 """
 
 

@@ -10,7 +10,7 @@ from petfsi.runs.origin import Origin
 from petfsi.runs.plan import default_options
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving import solver as solve
+from petfsi.solving.option_database import load_options
 from petfsi.solving.options import Options
 
 
@@ -32,7 +32,7 @@ def made_ready(
     ranks = comm.size, comm.allreduce(here.size, MPI.MAX)
     here.Free()
     on_root(comm, lambda: refuse_too_large(scene, ranks=ranks))
-    options = solve.load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
+    options = load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
     simulation = Simulation(comm, scene)
     unread = simulation.prepare() if origin is None else origin.begin(simulation)
     simulation.probe()

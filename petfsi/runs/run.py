@@ -31,7 +31,7 @@ from petfsi.scene.changes import RESUMABLE
 from petfsi.scene.load import dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving import solver as solve
+from petfsi.solving.option_database import load_options
 from petfsi.solving.options import Options
 
 #: Lines about what is wrong with a run directory.
@@ -103,7 +103,7 @@ def resume_run(
             lines = "".join(f"\n  {line}" for line in misfits[:MAX_TOLD])
             raise InputError(f"{directory} does not fit its checkpoint {found.path.name}; nothing was changed:{lines}")
         scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
-        options = solve.load_options(petsc_args, stored=files.options)
+        options = load_options(petsc_args, stored=files.options)
         with read_once():
             simulation = Simulation(comm, scene)
             # of the scene's start: it would move the fluid's faces to the restored solid
