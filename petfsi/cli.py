@@ -18,7 +18,7 @@ import click
 from petfsi import __version__
 from petfsi.errors import PetfsiError, is_memory
 from petfsi.messages import screen, shown
-from petfsi.runs.console import open_streams
+from petfsi.runs.console import is_launched, open_streams
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -396,6 +396,12 @@ def _launched_rank() -> int:
     return next((int(os.environ[name]) for name in names if os.environ.get(name, "").isdigit()), 0)
 
 
+def _want_no_network() -> None:
+    """Let Open MPI look for no network cards in a process that no launcher has started: it waits for them."""
+    if not is_launched():
+        os.environ.setdefault("OMPI_MCA_pml", "ob1")
+
+
 def _say(text: str) -> None:
     if _launched_rank() == 0:
         click.echo(text)
@@ -498,6 +504,7 @@ def _place(error: BaseException) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code."""
     open_streams()
+    _want_no_network()
     try:
         return cli.main(args=arguments, prog_name="petfsi", standalone_mode=False) or 0
     except click.ClickException as error:

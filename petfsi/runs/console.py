@@ -22,7 +22,8 @@ STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
 LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK", "MV2_COMM_WORLD_SIZE")
 
 
-def _is_launched() -> bool:
+def is_launched() -> bool:
+    """Return whether an MPI launcher has started this process."""
     return any(name in os.environ for name in LAUNCHERS)
 
 
@@ -66,7 +67,7 @@ class Console:
                 self._log = os.open(
                     log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666
                 )
-        if sys.stdout.isatty() and not _is_launched():
+        if sys.stdout.isatty() and not is_launched():
             self._start_bar(total)
 
     def _start_bar(self, total: int | None) -> None:

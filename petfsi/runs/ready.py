@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from mpi4py import MPI
 
 from petfsi.ranks import on_root
 from petfsi.runs.memory import refuse_too_large
-from petfsi.runs.origin import Origin
 from petfsi.runs.plan import default_options
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
 from petfsi.solving import solver as solve
 from petfsi.solving.options import Options
+
+if TYPE_CHECKING:
+    from petfsi.runs.origin import Origin
 
 
 def made_ready(
