@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -140,12 +141,13 @@ def run(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        from petfsi.ranks import on_root
-        from petfsi.scene.load import load_scene
+        with _staying():
+            from petfsi.ranks import on_root
+            from petfsi.scene.load import load_scene
 
-        loaded = on_root(comm, lambda: load_scene(scene, sets))
-        _start_petsc(petsc, comm)
-        from petfsi.runs.run import run_scene
+            loaded = on_root(comm, lambda: load_scene(scene, sets))
+            _start_petsc(petsc, comm)
+            from petfsi.runs.run import run_scene
 
         return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets, source)
 
@@ -169,8 +171,9 @@ def resume(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        _start_petsc(petsc, comm)
-        from petfsi.runs.run import resume_run
+        with _staying():
+            _start_petsc(petsc, comm)
+            from petfsi.runs.run import resume_run
 
         return resume_run(directory, steps, petsc, wall_limit, list(sets))
 
@@ -357,12 +360,28 @@ def new(ctx: click.Context, path: Path, kind: str) -> NoReturn:
 
 def _ready(scene: Scene, petsc: list[str]) -> Simulation:
     """Return the simulation of a scene, ready for its first step on this process alone."""
-    _start_petsc(petsc)
-    from mpi4py import MPI
+    with _staying():
+        _start_petsc(petsc)
+        from mpi4py import MPI
 
-    from petfsi.runs.ready import made_ready
+        from petfsi.runs.ready import made_ready
 
     return made_ready(MPI.COMM_SELF, scene, petsc)[0]
+
+
+@contextmanager
+def _staying() -> Iterator[None]:
+    """Let Python look for no garbage in what is imported meanwhile, then or later: all of it stays.
+
+    Looking through it, last when the process ends, takes longer than most of what is imported.
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        if not gc.get_freeze_count():  # once: of another run in one process there may be garbage by now
+            gc.freeze()
+        gc.enable()
 
 
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:
