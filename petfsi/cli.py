@@ -196,13 +196,16 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
         import numpy as np
 
         from petfsi.geometry.mesh_files import read_once
+        from petfsi.runs.ahead import ahead
         from petfsi.runs.memory import refuse_too_large
-        from petfsi.runs.plan import describe_plan
+        from petfsi.runs.plan import describe_plan, is_rehearsed
         from petfsi.scene.load import load_scene
 
         petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
         refuse_too_large(loaded)
+        if begun := ahead(loaded, ready=not quick and is_rehearsed(loaded)):
+            _say(begun)
         # what overflows is told of by those who judge what it gives
         with np.errstate(all="ignore"), read_once():
             plan = describe_plan(loaded, petsc, None if quick else lambda: _ready(loaded, petsc))

@@ -38,6 +38,16 @@ def open_streams() -> None:
             setattr(sys, name, open(number, mode, closefd=False))
 
 
+def say(line: str) -> None:
+    """Print a line at once; a reader who has left ends nothing."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    except (OSError, ValueError):
+        # what is left in the buffer would be tried again, and complained of, when Python ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 class Console:
     """Rank 0's voice; on other ranks every call does nothing. Not collective.
 
@@ -112,7 +122,7 @@ class Console:
             with self._watched() as bar:
                 bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         elif shown:
-            self._print(line)
+            say(line)
         if logged and self._log is not None:
             with suppress(OSError):  # unbuffered: a killed run leaves its last words
                 os.write(self._log, (line + "\n").encode())
@@ -125,14 +135,6 @@ class Console:
             yield self._bar
         except OSError:
             self._bar = None
-
-    def _print(self, line: str) -> None:
-        encoding = sys.stdout.encoding or "utf-8"
-        try:
-            print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
-        except (OSError, ValueError):
-            # what is left in the buffer would be tried again, and complained of, when Python ends
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def close(self) -> None:
         """Take the bar down and close the log."""

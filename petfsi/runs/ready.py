@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
@@ -19,11 +20,16 @@ if TYPE_CHECKING:
 
 
 def made_ready(
-    comm: MPI.Comm, scene: Scene, petsc_args: list[str], origin: Origin | None = None
+    comm: MPI.Comm,
+    scene: Scene,
+    petsc_args: list[str],
+    origin: Origin | None = None,
+    begins: Callable[[MPI.Comm, Scene], object] = lambda comm, scene: None,
 ) -> tuple[Simulation, list[str], Options]:
     """Return the simulation of a scene, ready for its first step, options that nothing reads, and all. Collective.
 
     Writes nothing: everything that can be wrong with the scene and the options is found here, its probes included.
+    ``begins`` is called once that seems to be possible at all.
 
     Raises
     ------
@@ -36,6 +42,7 @@ def made_ready(
     ranks = comm.size, comm.allreduce(here.size, MPI.MAX)
     here.Free()
     on_root(comm, lambda: refuse_too_large(scene, ranks=ranks))
+    begins(comm, scene)
     options = solve.load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
     simulation = Simulation(comm, scene)
     unread = simulation.prepare() if origin is None else origin.begin(simulation)
