@@ -80,7 +80,7 @@ class SolverCommand(click.Command):
         return own, petsc
 
 
-class Seconds(click.FloatRange):
+class Seconds(click.types.FloatParamType):
     """A time: a number."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -91,11 +91,15 @@ class Seconds(click.FloatRange):
         return found
 
 
+class Duration(Seconds, click.FloatRange):
+    """A time within a range."""
+
+
 _set = click.option("--set", "sets", multiple=True, metavar="KEY=VALUE", help="Override a setting, e.g. time.dt=0.01.")
 _steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps, then stop, resumable.")
 _wall = click.option(
     "--wall-limit",
-    type=Seconds(min=0, min_open=True),
+    type=Duration(min=0, min_open=True),
     metavar="SECONDS",
     help="Checkpoint and stop, resumable, before this much time has passed since the process began.",
 )
