@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -13,9 +14,9 @@ import click
 
 from petfsi import __version__
 from petfsi.messages import screen
-from petfsi.runs.arguments import Seconds, SolverCommand
+from petfsi.runs.arguments import Duration, Seconds, SolverCommand
 from petfsi.runs.console import open_streams
-from petfsi.runs.ending import INTERRUPTED, alone, launched_rank, say, together
+from petfsi.runs.ending import INTERRUPTED, alone, launched_rank, say, start_mpi, together
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -27,7 +28,7 @@ _set = click.option("--set", "sets", multiple=True, metavar="KEY=VALUE", help="O
 _steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps, then stop, resumable.")
 _wall = click.option(
     "--wall-limit",
-    type=Seconds(min=0, min_open=True),
+    type=Duration(min=0, min_open=True),
     metavar="SECONDS",
     help="Checkpoint and stop, resumable, before this much time has passed since the process began.",
 )
@@ -73,12 +74,13 @@ def run(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        from petfsi.ranks import on_root
-        from petfsi.scene.load import load_scene
+        with _staying():
+            from petfsi.ranks import on_root
+            from petfsi.scene.load import load_scene
 
-        loaded = on_root(comm, lambda: load_scene(scene, sets))
-        _start_petsc(petsc, comm)
-        from petfsi.runs.run import run_scene
+            loaded = on_root(comm, lambda: load_scene(scene, sets))
+            _start_petsc(petsc, comm)
+            from petfsi.runs.run import run_scene
 
         return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets, source)
 
@@ -102,8 +104,9 @@ def resume(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        _start_petsc(petsc, comm)
-        from petfsi.runs.run import resume_run
+        with _staying():
+            _start_petsc(petsc, comm)
+            from petfsi.runs.run import resume_run
 
         return resume_run(directory, steps, petsc, wall_limit, list(sets))
 
@@ -126,13 +129,16 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
         import numpy as np
 
         from petfsi.geometry.mesh_files import read_once
+        from petfsi.runs.ahead import ahead
         from petfsi.runs.memory import refuse_too_large
-        from petfsi.runs.plan import describe_plan
+        from petfsi.runs.plan import describe_plan, is_rehearsed
         from petfsi.scene.load import load_scene
 
         petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
         refuse_too_large(loaded)
+        if begun := ahead(loaded, ready=not quick and is_rehearsed(loaded)):
+            say(begun)
         # what overflows is told of by those who judge what it gives
         with np.errstate(all="ignore"), read_once():
             plan = describe_plan(loaded, petsc, None if quick else lambda: _ready(loaded, petsc))
@@ -290,12 +296,29 @@ def new(ctx: click.Context, path: Path, kind: str) -> NoReturn:
 
 def _ready(scene: Scene, petsc: list[str]) -> Simulation:
     """Return the simulation of a scene, ready for its first step on this process alone."""
-    _start_petsc(petsc)
-    from mpi4py import MPI
+    with _staying():
+        start_mpi()
+        _start_petsc(petsc)
+        from mpi4py import MPI
 
-    from petfsi.runs.ready import made_ready
+        from petfsi.runs.ready import made_ready
 
     return made_ready(MPI.COMM_SELF, scene, petsc)[0]
+
+
+@contextmanager
+def _staying() -> Iterator[None]:
+    """Let Python look for no garbage in what is imported meanwhile, then or later: all of it stays.
+
+    Looking through it, last when the process ends, takes longer than most of what is imported.
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        if not gc.get_freeze_count():  # once: of another run in one process there may be garbage by now
+            gc.freeze()
+        gc.enable()
 
 
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:

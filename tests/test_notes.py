@@ -12,6 +12,7 @@ from step_cases import loaded, prepared
 from petfsi.notes.bending import SLOWEST, Span, bending_period, excess, wave_time, widest_span
 from petfsi.notes.forms import form_of, held
 from petfsi.notes.notes import find_notes
+from petfsi.notes.solids import _steps
 from petfsi.runs.plan import describe_plan, read_files
 from petfsi.runs.run import run_scene
 from petfsi.scene.load import scene_from_dict
@@ -364,6 +365,15 @@ def test_a_bar_swings_as_long_as_is_said_of_it():
     form = form_of(solid, 2, None)
     said = bending_period(solid, form, Span(1.0, ("clamped", "free")))
     assert swing(thrown, said / 60, 130) == pytest.approx(said, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "number, said",
+    [(190.4, "190 steps"), (2.44, "2.4 steps"), (1.06, "1.1 steps"), (1.04, "1 step"), (1.0, "1 step")]
+    + [(0.96, "1 step"), (0.94, "1/1.1 step"), (1 / 2.4, "1/2.4 step")],
+)
+def test_a_number_of_steps_reads_well_near_one(number, said):
+    assert _steps(number) == said
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45])

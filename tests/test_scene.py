@@ -239,6 +239,7 @@ BROKEN = [
     (["probes.top.at=[0.5]"], "probes.top.at = [0.5]", "must have 2 items"),
     # time
     (["time.dt=3.0"], "time.dt = 3.0", "must not exceed time.end = 2 s"),
+    (["time.dt=2.000001"], "time.dt = 2.000001", "must not exceed time.end = 2 s"),
     (["time.dt=1e-10"], "time.dt = 1e-10", "makes 2e+10 steps"),
     (["time.dt=1e-320"], "time.dt", "steps to time.end = 2 s; at most 1e+08 may be"),
     # sides

@@ -113,6 +113,8 @@ def _steps(number: float) -> str:
     size = max(number, 1 / number)
     digits = 1 - math.floor(math.log10(size))
     text = f"{round(size, digits):,.{max(digits, 0)}f}" if size < 1e15 else f"{size:.1e}"
+    if text == "1.0":
+        return "1 step"
     return f"{text} steps" if number >= 1 else f"1/{text} step"
 
 

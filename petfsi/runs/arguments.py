@@ -52,7 +52,7 @@ class SolverCommand(click.Command):
         return own, petsc
 
 
-class Seconds(click.FloatRange):
+class Seconds(click.types.FloatParamType):
     """A time: a number."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -61,3 +61,7 @@ class Seconds(click.FloatRange):
         if found != found:
             self.fail(f"{value!r} is no number", param, ctx)
         return found
+
+
+class Duration(Seconds, click.FloatRange):
+    """A time within a range."""

@@ -15,6 +15,7 @@ import click
 
 from petfsi.errors import PetfsiError, is_memory
 from petfsi.messages import screen, shown
+from petfsi.runs.console import is_launched
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -66,6 +67,7 @@ def together(work: Callable[[Any], int]) -> int:
     for it in some collective call, once they have had ``AGREE_SECONDS`` to join.
     """
     try:
+        start_mpi()
         from mpi4py import MPI
     except Exception as error:
         code, text = _verdict(error)
@@ -85,6 +87,18 @@ def together(work: Callable[[Any], int]) -> int:
         for said in dict.fromkeys(said for _, said in verdicts):
             _complain(said)
     return verdicts[0][0]
+
+
+def start_mpi() -> None:
+    """Start MPI; a process that no launcher has started looks for no network cards, for which it would wait."""
+    alone = not is_launched() and "OMPI_MCA_pml" not in os.environ
+    if alone:
+        os.environ["OMPI_MCA_pml"] = "ob1"
+    try:
+        import mpi4py.MPI  # noqa: F401
+    finally:
+        if alone:  # what it starts is not alone
+            del os.environ["OMPI_MCA_pml"]
 
 
 def _all_arrive(comm: MPI.Comm) -> bool:
