@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.sparse import csr_matrix, vstack
 
 from petfsi.errors import InputError
@@ -19,7 +18,7 @@ from petfsi.fields.solids import Forces, Landing, SolidField
 from petfsi.geometry.bodies import build_bodies
 from petfsi.geometry.quadratic import Curved
 from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, Layout, new_block, set_csr
+from petfsi.petsc import IntType, Layout, new_block, set_csr, set_near_null_space
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 
@@ -104,11 +103,8 @@ class JointSolid(SolidField):
         set_csr(self.block, self._indptr, self._indices, self._values, new_pattern=True)
         self._added = AddedRows(self.comm)
         self._assembled = [0] * (len(self.parts) + 1)
-        vectors = []
-        for modes in zip(*(part.near_null_space() for part in self.parts), strict=True):
-            vectors.append(self.block.createVecRight())
-            vectors[-1].setArray(np.concatenate(modes))
-        self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
+        modes = zip(*(part.near_null_space() for part in self.parts), strict=True)
+        set_near_null_space(self.block, [np.concatenate(mode) for mode in modes])
 
     def _split(self, x: np.ndarray) -> list[tuple[NodalSolid, np.ndarray]]:
         return [(part, x[piece]) for part, piece in zip(self.parts, self._pieces, strict=True)]
