@@ -13,7 +13,8 @@ from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces
 from petfsi.fields.mac.grid.grid import MacGrid, three
 from petfsi.fields.mac.grid.marks import beside, spread
-from petfsi.fields.mac.walls.parts import LocalParts, Parts, ranges
+from petfsi.fields.mac.walls.local_parts import LocalParts, ranges
+from petfsi.fields.mac.walls.parts import Parts
 
 #: Cells that an extrapolation looks at on either side.
 AROUND = 3

@@ -12,7 +12,7 @@ from petfsi.fields.mac.grid.grid import MacGrid
 from petfsi.fields.mac.projection import pressure
 from petfsi.fields.mac.projection.extras import Extras
 from petfsi.fields.mac.projection.open_sides import OpenSides
-from petfsi.fields.mac.walls.parts import LocalParts
+from petfsi.fields.mac.walls.local_parts import LocalParts
 from petfsi.petsc import Layout
 
 
