@@ -24,10 +24,10 @@ from solid_cases import (
 )
 
 from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.equations.spectrum import TOLERANCE, largest_eigenvalue
 from petfsi.fields.solid.materials import lame_parameters
 from petfsi.fields.solid.patches import barycentric_gradients, grouped_mesh, grown_patches
 from petfsi.fields.solid.rules import quadratic_rule, shape_functions
-from petfsi.fields.solid.spectrum import TOLERANCE, largest_eigenvalue
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.quadratic import shape_forms

@@ -10,8 +10,8 @@ from mpi4py import MPI
 from petfsi.errors import InputError
 from petfsi.fields.base import Stock, Work
 from petfsi.fields.slabs import Reader, Slab
+from petfsi.fields.solid.equations.mass import AddedRows, Rows
 from petfsi.fields.solid.field import NodalSolid
-from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solids import Forces, Landing, SolidField
 from petfsi.fields.stacked import Stack, joined_surface, stacked_numbers
 from petfsi.geometry.bodies import build_bodies

@@ -18,7 +18,7 @@ from petfsi.fields.mac.carrying.sheets import Sheets
 from petfsi.fields.mac.carrying.transport import Advection, transport
 from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces, each
-from petfsi.fields.mac.initial import set_initial
+from petfsi.fields.mac.grid.initial import set_initial
 from petfsi.fields.mac.projection import pressure
 from petfsi.fields.mac.projection.covered import CoveredGrid
 from petfsi.fields.mac.projection.operators import Operators
@@ -352,7 +352,11 @@ class MacFluid(CoveredGrid):
 
         Without any such faces the arrays themselves are returned. Collective.
         """
-        return self._extension.faces(faces, self.face_kind, self.openness, self.narrow, self.sheets)
+        slits: list[np.ndarray] = []
+        if self.narrow is not None:
+            pairs = zip(self.openness, self.face_kind, strict=True)
+            slits = [(openness < pressure.SLIT) & (kind == kinds.PRESSURE) for openness, kind in pairs]
+        return self._extension.faces(faces, self.narrow, slits, self.sheets)
 
     # ---- observation ------------------------------------------------------------------------------------------
 

@@ -13,17 +13,17 @@ from petfsi.errors import InputError
 from petfsi.fields.base import Stock, Work
 from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.solid.conflicts import conflicts
-from petfsi.fields.solid.consistent import ConsistentEquation
-from petfsi.fields.solid.damping import RayleighDamping
 from petfsi.fields.solid.edges import Edges
-from petfsi.fields.solid.equation import Constituents
+from petfsi.fields.solid.equations.consistent import ConsistentEquation
+from petfsi.fields.solid.equations.damping import RayleighDamping
+from petfsi.fields.solid.equations.explicit import ExplicitEquation
+from petfsi.fields.solid.equations.gravity import Gravity
+from petfsi.fields.solid.equations.mass import Rows
+from petfsi.fields.solid.equations.nodal import Constituents
 from petfsi.fields.solid.exchange import NodalExchange
-from petfsi.fields.solid.explicit import ExplicitEquation
-from petfsi.fields.solid.gravity import Gravity
 from petfsi.fields.solid.initial import initial_values
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.loose import loose_motions, refusal, without_equilibrium
-from petfsi.fields.solid.mass import Rows
 from petfsi.fields.solid.partition import distribute
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.shrinkage import Shrinkage

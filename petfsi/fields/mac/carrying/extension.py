@@ -10,7 +10,6 @@ from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces
 from petfsi.fields.mac.grid.grid import MacGrid
 from petfsi.fields.mac.grid.sides import Surroundings
-from petfsi.fields.mac.projection import pressure
 
 
 class Extension:
@@ -63,20 +62,27 @@ class Extension:
         self.surroundings.fill_smoke(smoke)
 
     def faces(
-        self, faces: Faces, face_kind: list[np.ndarray], openness: list[np.ndarray], narrow: list[np.ndarray] | None,
-        sheets: Sheets | None,
-    ) -> Faces:  # fmt: skip
+        self, faces: Faces, narrow: list[np.ndarray] | None, slits: list[np.ndarray], sheets: Sheets | None
+    ) -> Faces:
         """Fill ghosts, bands and what lies beyond the sides; return copies that narrow faces are not read from.
 
-        Without any such faces the arrays themselves are returned. Collective.
+        Where there is nothing narrow the arrays themselves are returned. Collective.
+
+        Parameters
+        ----------
+        faces : Faces
+        narrow : list of ndarray of bool or None
+            Face arrays.
+        slits : list of ndarray of bool
+            Those of the narrow faces whose own velocity is not to be looked at either; empty where none are narrow.
+        sheets : Sheets or None
         """
-        extended, slits = [], []
+        extended = []
         for axis, v in enumerate(faces):
             self.grid.exchange_faces(axis, v)
             known = v if narrow is None else v.copy()
             self._bands[axis].fill(known)
             if narrow is not None:
-                slits.append((openness[axis] < pressure.SLIT) & (face_kind[axis] == kinds.PRESSURE))
                 np.copyto(v, known, where=~narrow[axis] | slits[axis])
                 self.grid.fill_sides(v, axis)
             self.grid.fill_sides(known, axis)

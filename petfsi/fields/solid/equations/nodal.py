@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from petfsi.fields.solid.damping import RayleighDamping
 from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.equations.damping import RayleighDamping
+from petfsi.fields.solid.equations.gravity import Gravity
+from petfsi.fields.solid.equations.lumped import LumpedEquation
+from petfsi.fields.solid.equations.mass import AddedRows, Rows
 from petfsi.fields.solid.exchange import NodalExchange
-from petfsi.fields.solid.gravity import Gravity
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
-from petfsi.fields.solid.lumped import LumpedEquation
-from petfsi.fields.solid.mass import AddedRows, Rows
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.supports import Supports
 from petfsi.fields.solids import Forces

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from petfsi.fields.solid.elements import State
-from petfsi.fields.solid.equation import Constituents, NodalEquation
-from petfsi.fields.solid.lumped import LumpedEquation
-from petfsi.fields.solid.spectrum import largest_eigenvalue
+from petfsi.fields.solid.equations.lumped import LumpedEquation
+from petfsi.fields.solid.equations.nodal import Constituents, NodalEquation
+from petfsi.fields.solid.equations.spectrum import largest_eigenvalue
 from petfsi.fields.solids import Forces
 from petfsi.integrators.base import Motion, Stage
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from petfsi.fields.solid.elements import State
-from petfsi.fields.solid.equation import Constituents, NodalEquation
+from petfsi.fields.solid.equations.nodal import Constituents, NodalEquation
 from petfsi.fields.solid.pattern import Pattern
 from petfsi.fields.solid.supports import Elimination
 from petfsi.fields.solids import Forces
