@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from petfsi.fields.mac import budget
@@ -10,6 +12,7 @@ from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces
 from petfsi.fields.mac.grid.grid import MacGrid
 from petfsi.fields.mac.projection import pressure
+from petfsi.fields.mac.projection.extras import Extras
 from petfsi.fields.mac.projection.open_sides import OpenSides
 from petfsi.fields.mac.projection.weight import Weight
 from petfsi.scene.expressions import Expression
@@ -92,3 +95,17 @@ class BodyForces:
             lifted = v if smoke is None else smoke  # without smoke nothing is lifted, and this not read
             pressure.add_forces(v, given[axis], kind, kinds.STEP[axis], plain, lifted, -buoyancy * dv, part)
             self.grid.exchange_faces(axis, v, width=1)
+
+    def power(
+        self, density: float, velocity: Faces, further: np.ndarray, face_kind: list[np.ndarray],
+        openness: list[np.ndarray], extras: Extras | None, sheets: Sheets | None,
+    ) -> float:  # fmt: skip
+        """Return this rank's share of the power of the last step's forces at a velocity, W. Not collective."""
+        forces = self.last
+        if forces is None:
+            return 0.0
+        if forces.smoke is not None:  # links may have changed since they were pushed
+            local = sheets.local if sheets is not None and len(sheets.table) else None
+            now = None if local is None else local.at_cells(forces.smoke, further)
+            forces = replace(forces, link_smoke=now)
+        return budget.power(self.grid, density, velocity, face_kind, openness, extras, forces)

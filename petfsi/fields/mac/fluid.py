@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +22,7 @@ from petfsi.fields.mac.projection import pressure
 from petfsi.fields.mac.projection.covered import CoveredGrid
 from petfsi.fields.mac.projection.operators import Operators
 from petfsi.fields.mac.projection.regions import box_around
-from petfsi.fields.mac.saved import Saved
+from petfsi.fields.mac.saved import Saved, parts_slabs, read_parts
 from petfsi.fields.mac.walls.parts import Parts
 from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.fields.slabs import Reader, Slab
@@ -392,13 +391,7 @@ class MacFluid(CoveredGrid):
     def power(self) -> Work:
         """Return this rank's share of the power of gravity and of what comes through sides, see ``budget``."""
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
-        gravity, forces = 0.0, self._body_forces.last
-        if forces is not None:
-            if forces.smoke is not None:  # links may have changed since they were pushed
-                local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
-                now = None if local is None else local.at_cells(forces.smoke, self.smoke_parts)
-                forces = replace(forces, link_smoke=now)
-            gravity = budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
+        gravity = self._body_forces.power(self.density, velocity, self.smoke_parts, *faces, self.extras, self.sheets)
         into = budget.inflow(
             self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.surroundings,
             self.open_sides, self.extras, self._extra_pressure,
@@ -446,7 +439,11 @@ class MacFluid(CoveredGrid):
     def state(self) -> dict[str, Slab]:
         """Return velocity, kinds, pressure, smoke and the transport's past: all that the next step reads."""
         arrays = self._saved().slabs()
-        return arrays if self.sheets is None else arrays | self._parts_state(self.sheets.table)
+        if self.sheets is None:
+            return arrays
+        rank = self.comm.rank
+        on_parts = parts_slabs(rank, self.sheets.table, self.velocity, self.smoke_parts, self._transport)
+        return arrays | on_parts | {"cut_at": whole_slab(rank, self.cut_at.ravel())}
 
     def _saved(self) -> Saved:
         """Return what a checkpoint holds of the grid's arrays."""
@@ -457,28 +454,14 @@ class MacFluid(CoveredGrid):
             self.face_kind, self.smoke, self.narrow, self.facing, self._transport,
         )  # fmt: skip
 
-    def _parts_state(self, table: Parts) -> dict[str, Slab]:
-        """Return divided cells and faces, and what is on them."""
-        rank = self.comm.rank
-        values = {f"parts_{name}": whole_slab(rank, array) for name, array in self._on_parts().items()}
-        return table.state(rank) | values | {"cut_at": whole_slab(rank, self.cut_at.ravel())}
-
-    def _on_parts(self) -> dict[str, np.ndarray]:
-        past = {name: faces.parts for name, faces in self._transport.past.items()}
-        return {"velocity_links": self.velocity.parts, "smoke_pieces": self.smoke_parts, **past}
-
     def _restore_parts(self, read: Reader) -> None:
         """Take back divided cells and faces, and what is on them; kinds are back already. Collective."""
         table = Parts.restored(self.grid, read)
         self.sheets = self._sheets_of(table)
         self._transport.advection.sheets = self.sheets
-        of_pieces = {"smoke_pieces": 0 if self.smoke is None else len(table.cell)}
-        stored = {name: read_whole(read, f"parts_{name}", of_pieces.get(name, len(table))) for name in self._on_parts()}
+        n_pieces = 0 if self.smoke is None else len(table.cell)
+        self.smoke_parts = read_parts(read, table, self.velocity, n_pieces, self._transport)
         self.cut_at = read_whole(read, "cut_at", self.cut_at.size).reshape(-1, self.dim)
-        self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
-        self._transport.carried.parts = self.velocity.parts
-        for name, parts in stored.items():
-            self._transport.past[name].parts = parts
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""

@@ -11,6 +11,8 @@ from petfsi.fields.mac.carrying.transport import Transport
 from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces
 from petfsi.fields.mac.grid.grid import MacGrid
+from petfsi.fields.mac.walls.parts import Parts
+from petfsi.fields.replicated import read_whole, whole_slab
 from petfsi.fields.slabs import Reader, Slab, scalar_slab
 from petfsi.fields.stored import outside, step_fault
 
@@ -85,3 +87,22 @@ class Saved:
         for name, faces in self.transport.past.items():
             for axis, v in enumerate(faces):
                 yield f"{name}_{'xyz'[axis]}", v, axis
+
+
+def parts_slabs(
+    rank: int, table: Parts, velocity: Faces, smoke_parts: np.ndarray, transport: Transport
+) -> dict[str, Slab]:
+    """Return divided cells and faces, and what is on them, as arrays that rank 0 owns."""
+    values = {"velocity_links": velocity.parts, "smoke_pieces": smoke_parts}
+    values |= {name: faces.parts for name, faces in transport.past.items()}
+    return table.state(rank) | {f"parts_{name}": whole_slab(rank, array) for name, array in values.items()}
+
+
+def read_parts(read: Reader, table: Parts, velocity: Faces, n_pieces: int, transport: Transport) -> np.ndarray:
+    """Fill the parts of velocities with what ``parts_slabs`` gave; return the smoke of ``n_pieces``. Collective."""
+    velocity.parts = read_whole(read, "parts_velocity_links", len(table))
+    smoke_parts = read_whole(read, "parts_smoke_pieces", n_pieces)
+    transport.carried.parts = velocity.parts
+    for name, faces in transport.past.items():
+        faces.parts = read_whole(read, f"parts_{name}", len(table))
+    return smoke_parts

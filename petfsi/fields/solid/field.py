@@ -21,7 +21,7 @@ from petfsi.fields.solid.equations.gravity import Gravity
 from petfsi.fields.solid.equations.mass import Rows
 from petfsi.fields.solid.equations.nodal import Constituents
 from petfsi.fields.solid.exchange import NodalExchange
-from petfsi.fields.solid.initial import initial_values
+from petfsi.fields.solid.initial import initial_values, set_off
 from petfsi.fields.solid.libraries import ElementLibrary, LoadLibrary
 from petfsi.fields.solid.loose import loose_motions, refusal, without_equilibrium
 from petfsi.fields.solid.partition import distribute
@@ -32,7 +32,7 @@ from petfsi.fields.solid.turning import Turning, bodies_of
 from petfsi.fields.solids import FAR, Forces, Landing, SolidField
 from petfsi.fields.stored import outside, refuse, step_fault
 from petfsi.geometry.meshes import SimplexMesh
-from petfsi.geometry.places import Tags, read_tags, with_middles
+from petfsi.geometry.places import tags_of_bodies
 from petfsi.integrators.base import Motion, Stage, moved, relinearised
 from petfsi.petsc import Layout, set_near_null_space
 from petfsi.ranks import on_root
@@ -102,7 +102,7 @@ class NodalSolid(SolidField):
         gravity = Gravity(scene.gravity or [], self._uniform)
         self.set_scale(comm.allreduce(float(self._uniform[0, :, 0].sum())) / len(mesh.points))
 
-        self._tags = on_root(comm, lambda: _tags(scene, solids, mesh))
+        self._tags = on_root(comm, lambda: tags_of_bodies(solids, mesh, scene.directory))
         self._supports = Supports(solids, mesh.points, self._node_body, self._number, components, self._tags)
         self.warnings = conflicts(self._supports.overlaps, scene.time.end)
         self._damping = RayleighDamping(solids, self._node_body[self._mesh.natural])
@@ -167,28 +167,20 @@ class NodalSolid(SolidField):
     # ---- set-up -----------------------------------------------------------------------------------------------
 
     def _set_motion(self, mesh: SimplexMesh, solids: Mapping[str, Solid], dt: float) -> None:
-        """Set off as the scene says, but for what supports prescribe."""
-        mine = self._mesh.natural[: self._mesh.n_owned]
+        """Set off as the scene says, and as supports do."""
         there = mesh.points, self._node_body, self.width
-        self.displacement = initial_values(solids, "displacement", *there)[mine]
+        displacement = initial_values(solids, "displacement", *there)
         velocity = initial_values(solids, "velocity", *there)
-        self.velocity = velocity[mine]
+        mine = self._mesh.natural[: self._mesh.n_owned]
+        on = self._supports, self.layout, self._number, mine
+        start = set_off(*on, displacement, velocity, self._has_inertia, dt)
+        self.displacement, self.velocity = start.displacement, start.velocity
+        self._equation.prescribed, self._jump = start.prescribed, start.jump
         self.moved = np.zeros(self.layout.n_local)
         self._stage: Stage | None = None
         self._geometry: np.ndarray | None = None
         self._past = tuple(np.zeros_like(self.velocity) for _ in self._integrator.past)
         self._past_dt = 0.0
-        prescribed = self._equation.prescribed = self._supports.initial_velocities(dt)
-        held, placed = self._supports.unknowns, self._supports.placed
-        given = np.empty_like(velocity)
-        given[self._number] = velocity
-        self._jump = self._supports.jumps(given.ravel()[held], dt)
-        here = (held >= self.layout.start) & (held < self.layout.end)
-        if self._has_inertia:
-            self.velocity.reshape(-1)[held[here] - self.layout.start] = prescribed[here]
-            here = here[placed]
-            where = held[placed][here] - self.layout.start
-            self.displacement.reshape(-1)[where] = self._supports.displacements(0.0)[here]
         self._measured = self.displacement.copy()
 
     @cached_property
@@ -481,13 +473,3 @@ class NodalSolid(SolidField):
     def _present(self) -> dict[str, Slab]:
         present = {"displacement": self.displacement, "velocity": self.velocity}
         return {name: self._exchange.stored(values) for name, values in present.items()}
-
-
-def _tags(scene: Scene, solids: Mapping[str, Solid], mesh: SimplexMesh) -> dict[str, Tags]:
-    """Return the groups of facets that the scene names, by body; numbers are those of the body's own nodes."""
-    found = {}
-    for body, (name, solid) in enumerate(solids.items()):
-        tags = read_tags(solid, scene.dim, f"solids.{name}", scene.directory)
-        elements = mesh.elements(body)
-        found[name] = with_middles(tags, elements - elements.min()) if tags else tags
-    return found
