@@ -97,7 +97,9 @@ class Simulation:
         self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.guard = EnergyGuard(comm, scene)
-        self.splitting = SplitWatch(scene.time.energy_limit >= 0) if self.solver.splits else None
+        self.splitting = None
+        if self.solver.splits and self.solid:
+            self.splitting = SplitWatch(comm, self.solid, scene.time.energy_limit >= 0)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
@@ -342,7 +344,7 @@ class Simulation:
         if self.stable.limited:
             kept["stable"] = held(self.stable.state(self.comm))
         if self.splitting is not None:
-            kept["splitting"] = held(self.splitting.state(self.comm))
+            kept["splitting"] = held(self.splitting.state())
         return kept
 
     def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:
