@@ -44,11 +44,12 @@ def resolution(view: View) -> Notes:
         across = _across(form, cell)
         if across.min() >= ENOUGH - _ROUND_OFF:
             continue
-        said = f"solids.{name} is {across.min():.2g} of the fluid's {unit} across"
-        if np.sort(across)[1] < ENOUGH - _ROUND_OFF:
-            finer = ENOUGH / np.sort(across)[1]
+        said, second = f"solids.{name} is {across.min():.2g} of the fluid's {unit} across", np.sort(across)[1]
+        if second < ENOUGH - _ROUND_OFF:
+            finer = ENOUGH / second
             yield Note(
-                f"{said}, where {ENOUGH:g} are few: forces on it are coarse; {finer:.2g} times finer {key} help",
+                f"solids.{name} is {second:.2g} of the fluid's {unit} across, where {ENOUGH:g} are few: forces on it "
+                f"are coarse; {finer:.2g} times finer {key} help",
                 warns=True,
             )
         elif scene.transfer == "ray":
