@@ -71,6 +71,7 @@ WARNED = {
     "a thin body by rays": (scene(bar(), water(), coupling={"transfer": "ray"}), '"cutcell" has it in its place'),
     "a fast start": (scene(None, water(initial={"velocity": [60.0, 0.0]})), "6 cells a step, by fluid.initial.vel"),
     "a fast jet": (scene(None, water(sides={"left": JET, "right": "open"})), "6 cells a step, by fluid.sides.left.in"),
+    "a jet into a closed box": (scene(bar(), water(sides={"left": JET})), "fluid.sides.left: what comes in can leave"),
     "a fast body": (scene(bar(initial={"velocity": ["70*x", 0.0]}), water()), "by solids.b.initial.velocity"),
     "a fast support": (
         scene(bar(supports=[CLAMP[0] | {"displacement": {"x": "sin(80*t)"}}]), water()), "supports.0.displacement"),
@@ -320,6 +321,15 @@ def test_an_inflow_that_swings_is_seen_wherever_it_is_nothing_at_equal_times():
         inflow = {"inflow": {"speed": "50*sin(4*pi*t)"}}
         made = scene(None, water(sides={"left": inflow, "right": "open"}), time={"end": end})
         assert "CFL: 5 cells a step" in "".join(warned(made))
+
+
+def test_a_jet_with_a_way_out_is_none_into_a_closed_box():
+    slow = {"inflow": JET["inflow"] | {"speed": 0.1}}
+    for sides in (
+        {"left": slow, "right": {"pressure": 0.0}}, {"left": {"inflow": slow["inflow"] | {"rest": "open"}}},
+        {"left": slow, "right": {"inflow": {"speed": -0.1}}},
+    ):  # fmt: skip
+        assert "can leave nowhere" not in "".join(warned(scene(bar(), water(sides=sides))))
 
 
 def test_a_narrow_inflow_is_seen():
