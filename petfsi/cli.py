@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import errno
+import gc
 import os
-import re
 import sys
-import time
-import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from petfsi import __version__
-from petfsi.errors import PetfsiError, is_memory
-from petfsi.messages import screen, shown
+from petfsi.messages import screen
+from petfsi.runs.arguments import Duration, Seconds, SolverCommand
 from petfsi.runs.console import open_streams
+from petfsi.runs.ending import INTERRUPTED, alone, launched_rank, say, start_mpi, together
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -26,75 +24,11 @@ if TYPE_CHECKING:
     from petfsi.scene.schema import Scene
     from petfsi.simulation import Simulation
 
-INTERRUPTED = 130
-#: Seconds that ranks have to fail together before one that failed alone ends the others.
-AGREE_SECONDS = 10.0
-#: Names that a system has no place for, as too long ones.
-NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
-#: What the machine, not petfsi, refuses.
-MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EMFILE, errno.EIO)
-
-_OPTION = re.compile(r"--?[A-Za-z]")
-
-
-class SolverCommand(click.Command):
-    """A command whose words with one dash belong to PETSc, each with the value behind it."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Take PETSc's options out, then parse the rest as click does."""
-        own, petsc = self._split(ctx, args)
-        ctx.meta["petsc"] = petsc
-        try:
-            return super().parse_args(ctx, own)
-        except click.MissingParameter as error:
-            if not petsc:
-                raise
-            hint = "Give it before the PETSc options: a word that follows one of them is its value."
-            raise click.UsageError(f"{error.format_message()} {hint}", ctx) from None
-
-    def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
-        """Put the arguments first, as they must stand before PETSc's options."""
-        arguments = [p.make_metavar(ctx) for p in self.get_params(ctx) if isinstance(p, click.Argument)]
-        return [*arguments, "[OPTIONS]", "[PETSc options]..."]
-
-    def _split(self, ctx: click.Context, args: list[str]) -> tuple[list[str], list[str]]:
-        flags = {name: getattr(p, "is_flag", False) for p in self.get_params(ctx) for name in p.opts}
-        own: list[str] = []
-        petsc: list[str] = []
-        words = list(reversed(args))
-        while words:
-            word = words.pop()
-            if word == "-h":
-                own.append("--help")
-            elif f"-{word}" in flags and not word.startswith("--"):
-                raise click.UsageError(f"'{word}': petfsi's own options have two dashes: -{word}", ctx)
-            elif re.match(r"-[A-Za-z]", word):
-                petsc.append(word)
-                if words and not _OPTION.match(words[-1]):
-                    petsc.append(words.pop())
-            else:
-                own.append(word)
-                if flags.get(word) is False and words:
-                    own.append(words.pop())
-        return own, petsc
-
-
-class Seconds(click.FloatRange):
-    """A time: a number."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return it; what is no number is within no range, and passes for one."""
-        found = super().convert(value, param, ctx)
-        if found != found:
-            self.fail(f"{value!r} is no number", param, ctx)
-        return found
-
-
 _set = click.option("--set", "sets", multiple=True, metavar="KEY=VALUE", help="Override a setting, e.g. time.dt=0.01.")
 _steps = click.option("--steps", type=click.IntRange(min=1), help="Take at most this many steps, then stop, resumable.")
 _wall = click.option(
     "--wall-limit",
-    type=Seconds(min=0, min_open=True),
+    type=Duration(min=0, min_open=True),
     metavar="SECONDS",
     help="Checkpoint and stop, resumable, before this much time has passed since the process began.",
 )
@@ -140,16 +74,17 @@ def run(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        from petfsi.ranks import on_root
-        from petfsi.scene.load import load_scene
+        with _staying():
+            from petfsi.ranks import on_root
+            from petfsi.scene.load import load_scene
 
-        loaded = on_root(comm, lambda: load_scene(scene, sets))
-        _start_petsc(petsc, comm)
-        from petfsi.runs.run import run_scene
+            loaded = on_root(comm, lambda: load_scene(scene, sets))
+            _start_petsc(petsc, comm)
+            from petfsi.runs.run import run_scene
 
         return run_scene(loaded, out or Path("runs") / scene.stem, steps, petsc, wall_limit, overwrite, sets, source)
 
-    ctx.exit(_together(work))
+    ctx.exit(together(work))
 
 
 @cli.command(cls=SolverCommand)
@@ -169,12 +104,13 @@ def resume(
     petsc = ctx.meta["petsc"]
 
     def work(comm: MPI.Comm) -> int:
-        _start_petsc(petsc, comm)
-        from petfsi.runs.run import resume_run
+        with _staying():
+            _start_petsc(petsc, comm)
+            from petfsi.runs.run import resume_run
 
         return resume_run(directory, steps, petsc, wall_limit, list(sets))
 
-    ctx.exit(_together(work))
+    ctx.exit(together(work))
 
 
 @cli.command(cls=SolverCommand)
@@ -193,20 +129,23 @@ def check(ctx: click.Context, scene: Path, sets: tuple[str, ...], quick: bool) -
         import numpy as np
 
         from petfsi.geometry.mesh_files import read_once
+        from petfsi.runs.ahead import ahead
         from petfsi.runs.memory import refuse_too_large
-        from petfsi.runs.plan import describe_plan
+        from petfsi.runs.plan import describe_plan, is_rehearsed
         from petfsi.scene.load import load_scene
 
         petsc = ctx.meta["petsc"]
         loaded = load_scene(scene, sets)
         refuse_too_large(loaded)
+        if begun := ahead(loaded, ready=not quick and is_rehearsed(loaded)):
+            say(begun)
         # what overflows is told of by those who judge what it gives
         with np.errstate(all="ignore"), read_once():
             plan = describe_plan(loaded, petsc, None if quick else lambda: _ready(loaded, petsc))
-        _say(plan)
+        say(plan)
         return 0
 
-    ctx.exit(_alone(work))
+    ctx.exit(alone(work))
 
 
 @cli.command()
@@ -253,20 +192,20 @@ def plot(
 
         wanted = Wanted(every, begin, end, quantity)
         if film is not None:
-            if _launched_rank() > 0:
+            if launched_rank() > 0:
                 return 0  # a film is one file
             from petfsi.output.film import film_run
 
             file, frames, speed = film_run(directory, Path(film) if film else None, wanted, fps)
-            _say(f"{file}: {frames} frame{'s' if frames != 1 else ''}, {speed:.3g} per second")
+            say(f"{file}: {frames} frame{'s' if frames != 1 else ''}, {speed:.3g} per second")
             return 0
         from petfsi.output.pictures import plot_run
 
         for picture in plot_run(directory, wanted, kind or "png"):
-            _say(str(picture))
+            say(str(picture))
         return 0
 
-    ctx.exit(_alone(work))
+    ctx.exit(alone(work))
 
 
 @cli.command()
@@ -284,12 +223,12 @@ def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoRet
         from petfsi.bench import describe, run_bench
 
         if name is None:
-            _say(describe())
+            say(describe())
             return 0
         _start_petsc()
         return run_bench(comm, name, out, quick)
 
-    ctx.exit(_together(work))
+    ctx.exit(together(work))
 
 
 @cli.command()
@@ -314,14 +253,14 @@ def sweep(ctx: click.Context, target: Path, **wanted: Any) -> NoReturn:
     """
 
     def work() -> int:
-        if _launched_rank() > 0:
+        if launched_rank() > 0:
             return 0
         from petfsi.sweeps.command import Wanted
         from petfsi.sweeps.command import sweep as run_sweep
 
-        return run_sweep(Wanted(target, **wanted), _say)
+        return run_sweep(Wanted(target, **wanted), say)
 
-    ctx.exit(_alone(work))
+    ctx.exit(alone(work))
 
 
 @cli.command()
@@ -333,10 +272,10 @@ def info(ctx: click.Context) -> NoReturn:
         _start_petsc()
         from petfsi.runs.plan import describe_info
 
-        _say(describe_info())
+        say(describe_info())
         return 0
 
-    ctx.exit(_alone(work))
+    ctx.exit(alone(work))
 
 
 @cli.command("help")
@@ -351,14 +290,14 @@ def help_(ctx: click.Context, key: str | None) -> NoReturn:
     def work() -> int:
         command = cli.get_command(ctx, key or "")
         if command is not None:
-            _say(command.get_help(click.Context(command, info_name=key, parent=ctx.parent)))
+            say(command.get_help(click.Context(command, info_name=key, parent=ctx.parent)))
             return 0
         from petfsi.scene.reference import explain, reference
 
-        _say(reference() if key is None else explain(key))
+        say(reference() if key is None else explain(key))
         return 0
 
-    ctx.exit(_alone(work))
+    ctx.exit(alone(work))
 
 
 @cli.command()
@@ -377,24 +316,41 @@ def new(ctx: click.Context, path: Path, kind: str) -> NoReturn:
     """
 
     def work() -> int:
-        if _launched_rank() > 0:
+        if launched_rank() > 0:
             return 0  # one file
         from petfsi.scene.starters import write_starter
 
-        _say(write_starter(path, kind))
+        say(write_starter(path, kind))
         return 0
 
-    ctx.exit(_alone(work))
+    ctx.exit(alone(work))
 
 
 def _ready(scene: Scene, petsc: list[str]) -> Simulation:
     """Return the simulation of a scene, ready for its first step on this process alone."""
-    _start_petsc(petsc)
-    from mpi4py import MPI
+    with _staying():
+        start_mpi()
+        _start_petsc(petsc)
+        from mpi4py import MPI
 
-    from petfsi.runs.ready import made_ready
+        from petfsi.runs.ready import made_ready
 
     return made_ready(MPI.COMM_SELF, scene, petsc)[0]
+
+
+@contextmanager
+def _staying() -> Iterator[None]:
+    """Let Python look for no garbage in what is imported meanwhile, then or later: all of it stays.
+
+    Looking through it, last when the process ends, takes longer than most of what is imported.
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        if not gc.get_freeze_count():  # once: of another run in one process there may be garbage by now
+            gc.freeze()
+        gc.enable()
 
 
 def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = None) -> None:
@@ -419,121 +375,13 @@ def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = Non
         os.environ.update(hidden)
 
 
-# ---- how commands end ---------------------------------------------------------------------------------------
-
-
-def _launched_rank() -> int:
-    """Return this process's rank as the launcher says, without starting MPI; 0 where there is none."""
-    names = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "MV2_COMM_WORLD_RANK")
-    return next((int(os.environ[name]) for name in names if os.environ.get(name, "").isdigit()), 0)
-
-
-def _say(text: str) -> None:
-    if _launched_rank() == 0:
-        click.echo(text)
-
-
-def _complain(text: str) -> None:
-    with suppress(OSError):  # nobody listens; the exit code still tells
-        click.echo(f"petfsi: {text}", err=True)
-
-
-def _alone(work: Callable[[], int]) -> int:
-    """Return the exit code of work that every rank does by itself; rank 0 alone speaks."""
-    try:
-        return work()
-    except BrokenPipeError:
-        raise  # click's: the reader of our output has left
-    except (Exception, KeyboardInterrupt) as error:
-        code, text = _verdict(error)
-        if _launched_rank() == 0:
-            _complain(text)
-        return code
-
-
-def _together(work: Callable[[Any], int]) -> int:
-    """Return the exit code of collective work.
-
-    Ranks that fail together end together, and rank 0 says why. A rank that fails alone ends the others, who wait
-    for it in some collective call, once they have had ``AGREE_SECONDS`` to join.
-    """
-    try:
-        from mpi4py import MPI
-    except Exception as error:
-        code, text = _verdict(error)
-        _complain(text)
-        return code
-    comm = MPI.COMM_WORLD
-    apart = comm.Dup()  # a meeting here cannot be mistaken for one of the computation's own collectives
-    try:
-        return work(comm)
-    except (Exception, KeyboardInterrupt) as error:
-        code, text = _verdict(error)
-    if not _all_arrive(apart):
-        _complain(f"rank {comm.rank} of {comm.size} failed alone: {text}")
-        comm.Abort(code)
-    verdicts = apart.allgather((code, text))
-    if comm.rank == 0:
-        for said in dict.fromkeys(said for _, said in verdicts):
-            _complain(said)
-    return verdicts[0][0]
-
-
-def _all_arrive(comm: MPI.Comm) -> bool:
-    """Return whether every rank comes here in time."""
-    request = comm.Ibarrier()
-    limit = time.monotonic() + AGREE_SECONDS
-    while not request.Test():
-        if time.monotonic() > limit:
-            return False
-        time.sleep(0.01)
-    return True
-
-
-def _verdict(error: BaseException) -> tuple[int, str]:
-    """Return the exit code and the words for an exception."""
-    if os.environ.get("PETFSI_TRACEBACK") == "1":
-        story = "".join(traceback.format_exception(error)).rstrip()
-        return _verdict_in_short(error)[0], story
-    return _verdict_in_short(error)
-
-
-def _verdict_in_short(error: BaseException) -> tuple[int, str]:
-    if isinstance(error, PetfsiError):
-        return error.exit_code, screen(str(error), first=len("petfsi: "))
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, "interrupted"
-    if is_memory(error):
-        return 1, "the machine's memory is used up; 'petfsi check' estimates what a scene needs"
-    if isinstance(error, OSError) and error.errno in NAMES:
-        return 2, f"{shown(error.filename or 'a file', 200)}: {error.strerror}"
-    if isinstance(error, UnicodeEncodeError):
-        return 2, f"{shown(error.object, 200)}: is no text that can be written down (UTF-8)"
-    if isinstance(error, OSError) and error.errno in MACHINE:
-        return 1, f"{shown(error.filename or 'a file', 200)}: {error.strerror}"
-    what = shown(" ".join(str(error).split()), 300)
-    return 1, (
-        f"{type(error).__name__}: {what} (at {_place(error)}); this is a defect in petfsi; "
-        "set PETFSI_TRACEBACK=1 and run again to see where it comes from"
-    )
-
-
-def _place(error: BaseException) -> str:
-    """Return the innermost line of petfsi that an exception passed."""
-    package = str(Path(__file__).parent)
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(package)]
-    if not frames:
-        return "an unknown place"
-    return f"petfsi/{Path(frames[-1].filename).relative_to(package)}:{frames[-1].lineno}"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code."""
     open_streams()
     try:
         return cli.main(args=arguments, prog_name="petfsi", standalone_mode=False) or 0
     except click.ClickException as error:
-        if _launched_rank() == 0:
+        if launched_rank() == 0:
             error.__dict__["message"] = screen(error.message)
             with suppress(OSError):
                 error.show()

@@ -56,6 +56,15 @@ def new_block(comm: MPI.Comm, rows: Layout, cols: Layout, block_size: int = 1) -
     return mat
 
 
+def set_near_null_space(mat: PETSc.Mat, modes: list[np.ndarray]) -> None:
+    """Tell multigrid motions of this rank's unknowns that cost nearly nothing. Collective."""
+    vectors = []
+    for mode in modes:
+        vectors.append(mat.createVecRight())
+        vectors[-1].setArray(mode)
+    mat.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=mat.comm))
+
+
 def forget_inodes(mat: PETSc.Mat) -> None:
     """Multiply row by row from now on: whether PETSc groups equal rows, and so rounds, depends on former patterns."""
     mat.setOption(PETSc.Mat.Option.USE_INODES, False)

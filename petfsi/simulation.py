@@ -11,9 +11,7 @@ from mpi4py import MPI
 
 from petfsi import build, causes, limits, petsc
 from petfsi.accounts import Accounts
-from petfsi.couplings.base import Coupling
-from petfsi.errors import FinalError, InputError, NoSolutionError, NotStoredError, SolveError
-from petfsi.fields.base import Field
+from petfsi.errors import FinalError, InputError, NotStoredError, SolveError
 from petfsi.fields.fluids import FluidField, PressureFluid
 from petfsi.fields.slabs import Reader, State, held, scalar_slab
 from petfsi.fields.solids import SolidField
@@ -22,10 +20,10 @@ from petfsi.probes import Probes
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 from petfsi.solving import start
-from petfsi.solving.balance import Balance
+from petfsi.solving.convergence import Outcome
 from petfsi.solving.diagonal import DiagonalSolver
-from petfsi.solving.regions import ClosedRegions
-from petfsi.solving.solver import Outcome, Solver
+from petfsi.solving.equations import Equations
+from petfsi.solving.solver import Solver
 from petfsi.solving.splitting import SplitWatch
 from petfsi.solving.system import System
 from petfsi.substeps import StableStep
@@ -42,10 +40,6 @@ NOTHING = np.zeros(0)
 #: A start that changes the kinetic energy by more than this part of it is told of.
 START_NOTED = 1e-3
 
-#: A step is solved again at most so many times to close the volumes of regions, mostly twice; the next one sees what
-#: is left.
-REPEATS = 6
-
 
 class Simulation:
     """Fields, couplings and solver of a scene, at one instant.
@@ -54,6 +48,8 @@ class Simulation:
     ----------
     step, time, dt : int, float, float
         The present step number, its time (s) and the length of the step that led there (s; at first of the next).
+    equations : Equations
+        Those of a step, with their system, solver and closed regions.
     substeps : int
         Into how many the last step was divided: because an explicit scheme needs shorter ones, or a solve failed.
     report : callable
@@ -86,8 +82,8 @@ class Simulation:
         self.fluid = next((field for field in self.fields if isinstance(field, FluidField)), None)
         if self.solid and self.fluid:
             self.solid.set_scale(self.fluid.density * self.fluid.cell_volume)
-        self.system = System(comm, self.fields, self.couplings)
-        self.solver = self._make_solver()
+        self.equations = Equations(comm, self.fields, self.couplings, static=not scene.time.scheme.inertia)
+        self.solver, self.regions = self.equations.solver, self.equations.regions
         self.stable = StableStep(self.fields, scene.time)
         self.dt = self._stepping.length(0.0)
         # an explicit step fails for being too long, which is found before it is taken
@@ -95,24 +91,23 @@ class Simulation:
         self.substeps = 1
         self.report: Callable[[str], None] = lambda text: None
         self.notes: list[str] = []
-        self.regions: ClosedRegions | None = None
-        if isinstance(self.fluid, PressureFluid):
-            self.regions = ClosedRegions(self.system, self.fluid, self.solid, self.solver.decoupled)
         if self.solid:
             limits.refuse_far_start(self.solid)
         self._probes = Probes(scene, self.solid, self.fluid)
         self.watch = watch(comm, scene, self.solid)
         self.accounts = Accounts(comm, scene, self.fields, self.couplings, self.regions)
         self.guard = EnergyGuard(comm, scene)
-        self.splitting = SplitWatch(scene.time.energy_limit >= 0) if self.solver.splits else None
+        self.splitting = None
+        if self.solver.splits and self.solid:
+            self.splitting = SplitWatch(comm, self.solid, scene.time.energy_limit >= 0)
         self.outcome = Outcome(0, 0.0)
         self.volume_error = 0.0
         self.phases = dict.fromkeys(PHASES, 0.0)
 
-    def _make_solver(self) -> Solver | DiagonalSolver:
-        if all(field.diagonal for field in self.system.fields) and len(self.system.fields) < 2:
-            return DiagonalSolver(self.system)
-        return Solver(self.system, static=not self.scene.time.scheme.inertia)
+    @property
+    def system(self) -> System:
+        """The system of the present step."""
+        return self.equations.system
 
     @property
     def divides(self) -> bool:
@@ -205,21 +200,16 @@ class Simulation:
             for coupling in self.couplings:
                 coupling.couple(t, dt)
         with self.phase("assemble"):
-            changed = self._assemble(t, dt)
-            self._balance(dt)
+            changed = self.equations.assemble(t, dt)
+            self.equations.balance(dt)
         with self.phase("solve"), causes.elements_named(self.solid):
-            return self.solver.solve(changed, lambda values: self._restage(values, t, dt)) + self._close(t, dt)
+            return self.equations.solve(changed, t, dt)
 
     def _rewind(self) -> None:
         """Put everything back to before the step that has failed; nothing of it was accepted. Collective."""
-        parts: list[Field | Coupling] = [*self.fields, *self.couplings]
-        for part in parts:
-            part.rewind()
-        if self.regions:
-            self.regions.rewind()
+        self.equations.rewind()
         if self.splitting is not None:
             self.splitting.forget()
-        self.solver.reset()
 
     def forget(self) -> None:
         """Forget what a resumed run could not know: it must go on in the same way. Collective."""
@@ -229,8 +219,7 @@ class Simulation:
 
     def close(self) -> None:
         """Free what PETSc holds of it: it can be asked nothing afterwards. Collective."""
-        self.solver.reset()
-        self.system.close()
+        self.equations.close()
         petsc.collect_garbage()
 
     def prepare(self, resumes_at: float | None = None) -> list[str]:
@@ -266,9 +255,9 @@ class Simulation:
             self.dt = self._stepping.length(resumes_at)
         for coupling in self.couplings:
             coupling.couple(self.time, self.dt)
-        self._assemble(self.time, self.dt)
+        self.equations.assemble(self.time, self.dt)
         with np.errstate(all="ignore"):  # what overflows is found by those who judge the solve
-            self._check_equations()
+            self.equations.check(self.time, self.dt)
 
     def _fit_velocities(self) -> None:
         """Let supports, solids and fluid begin with velocities that fit each other; note what that did. Collective."""
@@ -288,71 +277,6 @@ class Simulation:
                 f"the velocities given at t = 0 did not fit {misfit}, and were brought to the nearest that do: "
                 f"kinetic energy {after:.4g} J, not {before:.4g} J"
             )
-
-    def _check_equations(self) -> None:
-        """Refuse a scene whose first step has no solution: before anything is written. Collective."""
-        wrong = self.solid.unheld() if self.solid else []
-        if self.regions:
-            fluid = self.regions.fluid
-            fluid.rehearse(self.time, self.dt)
-            fault = Balance(self.regions).fault(self.dt)
-            fluid.rehearse(self.time, 0.0)
-            wrong += [f"{fault} (in the first step)"] if fault else []
-        if wrong:
-            raise InputError("\n".join(wrong))
-
-    def _assemble(self, t: float, dt: float) -> bool:
-        if self.regions:
-            self.regions.find()
-            self.regions.aim(t, dt)
-        for field in self.fields:
-            field.assemble(t, dt)
-        for coupling in self.couplings:
-            coupling.assemble(t, dt)
-        if self.system.is_outdated():  # unknowns came or went
-            self.system = System(self.comm, self.fields, self.couplings, before=self.system)
-            self.solver.adopt(self.system)
-            if self.regions:
-                self.regions.adopt(self.system)
-        changed = self.system.refresh()
-        if self.regions:
-            self.regions.attach()
-        return changed
-
-    def _balance(self, dt: float) -> None:
-        """Raise if what flows into closed regions has nowhere to go, else make up for what is left over. Collective."""
-        if not self.regions:
-            return
-        balance = Balance(self.regions)
-        fault = balance.fault(dt)
-        if fault:
-            raise NoSolutionError(fault)
-        if balance.make_up():
-            self.system.refresh(guess=False)
-
-    def _close(self, t: float, dt: float) -> Outcome:
-        """Solve again, with sources that close the volumes of regions, while that is wanted. Collective."""
-        outcome = Outcome(0, 0.0)
-        if not self.regions or not self.solid or isinstance(self.solver, DiagonalSolver):
-            return outcome
-        for repeat in range(REPEATS + 1):
-            self.regions.measure(self.system.values()[self.system.fields.index(self.solid)], dt)
-            if repeat == REPEATS or self.solver.fixed_iterations or not self.regions.improve():
-                break
-            Balance(self.regions).make_up()
-            self.system.refresh(guess=False)
-            outcome += self.solver.improve(lambda values: self._restage(values, t, dt))
-        return outcome
-
-    def _restage(self, values: list[np.ndarray], t: float, dt: float) -> bool:
-        """Make the system that of other values of the fields; return whether the operator has changed. Collective."""
-        # not any(): every field must hear
-        if not sum([field.relinearise(x) for field, x in zip(self.system.fields, values, strict=True)]):
-            return False
-        parts: list[Field | Coupling] = [*self.fields, *self.couplings]
-        for part in parts:
-            part.assemble(t, dt)
-        return self.system.refresh(guess=False)
 
     def _accept(self, t: float, dt: float) -> None:
         if self.regions:
@@ -397,26 +321,12 @@ class Simulation:
         return self._probes.values()
 
     def divergence(self) -> float:
-        """Return the largest net outflow of a fluid cell in the last step, walls included, per face area, m/s.
-
-        Collective.
-        """
-        if not isinstance(self.fluid, PressureFluid):
-            return 0.0
-        outflow = self.system.residual.array[self.system.piece(self.fluid.name)] / self.fluid.row_scale
-        area = self.fluid.cell_volume ** ((self.scene.dim - 1) / self.scene.dim)
-        return self.comm.allreduce(float(np.abs(outflow).max(initial=0.0)), MPI.MAX) / area
+        """Return the largest net outflow of a fluid cell in the last step, see ``Equations``. Collective."""
+        return self.equations.divergence()
 
     def assemblies(self) -> dict[str, int]:
         """Return how often each block was assembled."""
-        return {
-            **{field.name: field.n_assembled for field in self.system.fields},
-            **{
-                "-".join(next(iter(coupling.blocks))): coupling.n_assembled
-                for coupling in self.couplings
-                if coupling.blocks
-            },
-        }
+        return self.equations.assemblies()
 
     def state(self) -> dict[str, State]:
         """Return all that the next step reads, by field, and of clock, closed regions, accounts and stable step."""
@@ -434,7 +344,7 @@ class Simulation:
         if self.stable.limited:
             kept["stable"] = held(self.stable.state(self.comm))
         if self.splitting is not None:
-            kept["splitting"] = held(self.splitting.state(self.comm))
+            kept["splitting"] = held(self.splitting.state())
         return kept
 
     def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:

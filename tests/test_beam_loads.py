@@ -24,7 +24,7 @@ def forces(solid, d=None, time=0.0):
     """Return the loads' forces on all nodes, in the scene's order, and their tangent's product with d."""
     mesh = solid._mesh
     d = np.zeros((mesh.n_owned, 3)) if d is None else d
-    at = State(solid._with_shared(d), *2 * [np.zeros((len(mesh.points), 3))])
+    at = State(solid._exchange.with_shared(d), *2 * [np.zeros((len(mesh.points), 3))])
     b = np.zeros((mesh.n_owned, 3))
     solid._loads.assemble(time, at, 0.0, None, b)
     return solid._everywhere(b)

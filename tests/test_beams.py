@@ -151,7 +151,7 @@ def test_the_near_null_space_is_that_of_the_stiffness(theory):
     modes = solid.near_null_space()
     assert len(modes) == 3
     for mode in modes:
-        u = solid._elements._of_elements(solid._with_shared(mode.reshape(-1, 3)))
+        u = solid._elements._of_elements(solid._exchange.with_shared(mode.reshape(-1, 3)))
         assert np.abs(K @ u[:, :, None]).max(initial=0.0) < 1e-12 * np.abs(K).max(initial=1.0)
     assert solid.block.getBlockSize() == 3
 
@@ -164,7 +164,7 @@ def test_light_motions_bend_without_shear():
     assert len(motions) == 2 * 3
     assert len(solid.light_motions(5, 0.2, 6)) == 6
     for motion in motions:
-        u = solid._with_shared(motion.reshape(-1, 3))[solid._mesh.cells]
+        u = solid._exchange.with_shared(motion.reshape(-1, 3))[solid._mesh.cells]
         across = (u[:, :, :2] @ [-0.8, 0.6])[:, :2]
         slope = (across[:, 1] - across[:, 0]) / solid._elements.length
         # of a parabola the mean of the slopes at both ends is that of the chord

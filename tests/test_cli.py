@@ -14,7 +14,7 @@ from processes import environment, launcher
 from petfsi import __version__, cli
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.solid import SimplexSolid
-from petfsi.runs.console import Console
+from petfsi.runs.console import LAUNCHERS, Console
 from petfsi.runs.plan import DEFAULT_OPTIONS, default_options, describe_plan, skipped
 from petfsi.scene.load import scene_from_dict
 
@@ -228,13 +228,13 @@ def test_a_shell_sees_the_exit_code(scene):
 
 TOGETHER = """
 import sys
-from petfsi import cli
 from petfsi.errors import InputError, SolveError
 from petfsi.fields.solid import SimplexSolid
-cli.AGREE_SECONDS = {patience}
+from petfsi.runs import ending
+ending.AGREE_SECONDS = {patience}
 def work(comm):
     {body}
-sys.exit(cli._together(work))
+sys.exit(ending.together(work))
 """
 
 
@@ -289,6 +289,48 @@ def test_the_plan_counts_what_is_solved():
 def test_the_plan_says_which_options_apply():
     text = describe_plan(plan_scene(), ["-fsi_ksp_rtol", "1e-6", "-options_file", "split.opts", "-log_view"])
     assert "options:     split.opts; over it -fsi_ksp_rtol 1e-6 -log_view\n" in text
+
+
+def test_a_check_imports_nothing_of_outputs_and_leaves_its_imports_alone():
+    scene = Path(__file__).parents[1] / "jobs" / "bar.toml"
+    words = ["check", str(scene), "--set", "fluid.cells=[12, 8, 8]"]
+    code = (
+        f"import gc, sys; from petfsi import cli; cli.main({words!r}); print(gc.get_freeze_count(), gc.isenabled()); "
+    )
+    frozen, modules = petfsi(code=f"{code}print(sorted(sys.modules))").stdout.splitlines()[-2:]
+    assert int(frozen.split()[0]) > 10_000 and frozen.split()[1] == "True"
+    for name in ("'h5py'", "'petfsi.output.checkpoint'", "'petfsi.fields.sph'", "'petfsi.fields.beam'", "'matplotlib'"):
+        assert name not in modules
+
+
+@pytest.mark.parametrize("given, seen", [({}, "ob1"), ({"OMPI_MCA_pml": "cm"}, "cm"), ({"PMIX_RANK": "0"}, "None")])
+def test_a_process_alone_looks_for_no_network_unless_it_is_told_to(given, seen, monkeypatch):
+    for name in ("OMPI_MCA_pml", *LAUNCHERS):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    code = """
+import os, sys
+class Seen:
+    def find_spec(self, name, path=None, target=None):
+        if name == "mpi4py.MPI":
+            print(os.environ.get("OMPI_MCA_pml"))
+            raise ImportError
+from petfsi.runs.ending import start_mpi
+sys.meta_path.insert(0, Seen())
+try:
+    start_mpi()
+except ImportError:
+    print(os.environ.get("OMPI_MCA_pml"))
+"""
+    before = given.get("OMPI_MCA_pml", "None")
+    assert petfsi(code=code).stdout.split() == [seen, before]
+
+
+def test_help_tells_no_range_that_has_no_ends(here):
+    told = " ".join(here("plot", "--help").stdout.split())
+    assert "--from T Draw outputs from this time on, s. --to T Draw outputs up to this time, s. --every K" in told
+    assert "None" not in told
 
 
 def test_a_quick_check_prints_the_plan_and_takes_no_heavy_import():

@@ -16,7 +16,7 @@ from petfsi.output.history import read_history
 from petfsi.runs.origin import Origin
 from petfsi.scene.load import load_scene
 from petfsi.simulation import Simulation
-from petfsi.solving import solver
+from petfsi.solving.option_database import load_options
 
 BLOCK = """
 dim = 2
@@ -224,7 +224,7 @@ def test_a_checkpoint_that_a_run_at_work_replaces_is_looked_for_again(scene, her
     assert origin.found.step == 6
     for path in Path("old/checkpoint").glob("000006.*"):
         path.unlink()
-    options = solver.load_options([], base="monolithic.opts")
+    options = load_options([], base="monolithic.opts")
     assert options.chosen
     simulation = Simulation(comm, load_scene(scene))
     origin.begin(simulation)

@@ -24,10 +24,10 @@ from solid_cases import (
 )
 
 from petfsi.fields.solid.elements import State
+from petfsi.fields.solid.equations.spectrum import TOLERANCE, largest_eigenvalue
 from petfsi.fields.solid.materials import lame_parameters
 from petfsi.fields.solid.patches import barycentric_gradients, grouped_mesh, grown_patches
 from petfsi.fields.solid.rules import quadratic_rule, shape_functions
-from petfsi.fields.solid.spectrum import TOLERANCE, largest_eigenvalue
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.meshes import box_mesh
 from petfsi.geometry.quadratic import shape_forms
@@ -392,7 +392,7 @@ def test_the_stable_step_is_that_of_the_free_unknowns_on_any_ranks(kind):
     many, one = (field(2, comm, integrator="symplectic-euler", b=block) for comm in (MPI.COMM_WORLD, MPI.COMM_SELF))
     d = np.zeros_like(one.reference)
     K, _ = respond(one._elements, pattern_of(one._mesh), d)
-    free = ~one._is_held.ravel()
+    free = ~one._equation.is_held.ravel()
     mass = one._elements.lumped_mass(len(d)).ravel()[free]
     limit = 2 / np.sqrt(eigh(K[free][:, free], np.diag(mass), eigvals_only=True)[-1])
     assert one.stable_step() == pytest.approx(limit, rel=TOLERANCE)

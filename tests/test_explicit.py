@@ -24,8 +24,8 @@ def true_limit(scene):
     """Return 2 over the root of the largest eigenvalue of the free nodes' M^-1 K' at the start, by brute force."""
     with prepared(scene, comm=MPI.COMM_SELF) as sim:
         solid = sim.solid
-        mass = solid._lumped.mass.ravel()
-        free = ~solid._is_held.ravel()
+        mass = solid._equation.lumped.mass.ravel()
+        free = ~solid._equation.is_held.ravel()
         d, K = solid.displacement, []
         for e in np.eye(len(mass)) * 1e-6:
             forces = [np.empty_like(d) for _ in range(2)]

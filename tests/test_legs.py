@@ -157,7 +157,7 @@ def test_another_damping_is_that_of_a_simulation_that_had_it_from_there(scene, c
                 sim.forget()
                 bodies = sim.solid._elements.bodies
                 bodies.mass_damping[:], bodies.stiffness_damping[:] = 2.0, 0.05
-                sim.solid._damps = True
+                sim.solid._equation.damps = True
             sim.advance()
             tip = sim.solid.probe("block", [1.0, 0.5], "displacement")
             assert tip.tolist() == [rows["tip.x"][step], rows["tip.y"][step]], step

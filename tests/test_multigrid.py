@@ -84,14 +84,14 @@ def solved(scene, options, *more, comm=MPI.COMM_WORLD, steps=1):
     with only_options(["-options_file", options, *more]):
         sim = Simulation(comm, scene)
         sim.prepare()
-        sim.counts, solve = [], sim.solver.solve_linear
+        sim.counts, solve = [], sim.solver.linear.solve
 
         def counted(*args, **more):
             iterations, norms = solve(*args, **more)
             sim.counts.append(iterations)
             return iterations, norms
 
-        sim.solver.solve_linear = counted
+        sim.solver.linear.solve = counted
         for _ in range(steps):
             sim.advance()
         values = dict(zip((f.name for f in sim.fields), sim.system.values(), strict=True))

@@ -159,8 +159,8 @@ def test_a_split_step_cannot_carry_newton():
 def test_linear_statics_assemble_and_factor_once(options):
     scene = block((4, 3), material="linear", gravity=["t", "-2*t"], time={"integrator": "static", "dt": 0.2})
     with prepared(scene, *options) as sim:
-        set_up, count = sim.solver.set_up, []
-        sim.solver.set_up = lambda: (count.append(1), set_up())
+        set_up, count = sim.solver.linear.set_up, []
+        sim.solver.linear.set_up = lambda: (count.append(1), set_up())
         displacements = []
         for _ in range(5):
             sim.advance()

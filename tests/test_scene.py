@@ -239,6 +239,7 @@ BROKEN = [
     (["probes.top.at=[0.5]"], "probes.top.at = [0.5]", "must have 2 items"),
     # time
     (["time.dt=3.0"], "time.dt = 3.0", "must not exceed time.end = 2 s"),
+    (["time.dt=2.000001"], "time.dt = 2.000001", "must not exceed time.end = 2 s"),
     (["time.dt=1e-10"], "time.dt = 1e-10", "makes 2e+10 steps"),
     (["time.dt=1e-320"], "time.dt", "steps to time.end = 2 s; at most 1e+08 may be"),
     # sides
@@ -751,6 +752,15 @@ def test_steps_reach_the_end_and_round_off_adds_none(end, dt, steps):
     assert not stepping.finished(stepping.after(steps - 1, 0.0, dt), dt)
 
 
+@pytest.mark.parametrize("end, dt", [(0.3, 0.1), (0.7, 0.1), (0.9, 0.3), (0.6, 0.2), (1.0, 1 / 3), (1.1, 0.00011)])
+def test_times_are_multiples_on_paper_and_the_last_is_the_end(end, dt):
+    stepping = Stepping(scene_from_dict(layer(f"time.end={end}", f"time.dt={dt}")).time)
+    stepping.length(0.0)
+    n = stepping.count(0)
+    assert stepping.after(n, 0.0, dt) == end
+    assert stepping.after(3, 0.0, dt) == float(f"{3 * dt:.12g}")
+
+
 @pytest.mark.parametrize(
     "end, dt, last",
     [(1.0, "0.3", [0.3, 0.2, 0.2]), (1.0, "0.4", [0.4, 0.3, 0.3]), (1.5, "1.0", [0.75, 0.75])]
@@ -763,7 +773,7 @@ def test_the_end_is_met_and_the_last_two_steps_share_what_is_left(end, dt, last)
     while not taken or not stepping.finished(t, taken[-1]):
         taken.append(stepping.length(t))
         t = stepping.after(len(taken), t, taken[-1])
-    assert t == pytest.approx(end, rel=1e-14)
+    assert t == end
     assert taken[-len(last) :] == pytest.approx(last, rel=1e-9)
     assert counted == len(taken)
 

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from petfsi.fields.sph.dummies import Domain, divided, wall_dummies
+from petfsi.fields.sph.domain import Domain
+from petfsi.fields.sph.dummies import wall_dummies
 from petfsi.fields.sph.fill import hydrostatic, liquid
 from petfsi.fields.sph.kernels import Kernel
 from petfsi.fields.sph.law import Law
+from petfsi.fields.sph.layers import divided
 from petfsi.fields.sph.solids import build_solids, nearest, pseudonormals
 from petfsi.geometry.obstacles import obstacle_surface
 from petfsi.scene.schema import Obstacle

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from step_cases import loaded, motion, prepared
 
 from petfsi.scene.load import scene_from_dict
-from petfsi.solving.solver import Solver
+from petfsi.solving.linear import LinearSolver
 
 SCENES = Path(__file__).parent / "scenes"
 OPTIONS = {
@@ -125,7 +125,7 @@ def test_a_start_that_fits_is_left_alone(monkeypatch):
     def solve(*_):
         raise AssertionError("something was solved")
 
-    monkeypatch.setattr(Solver, "solve_linear", solve)
+    monkeypatch.setattr(LinearSolver, "solve", solve)
     for velocity in ([0.0, 0.0], [0.3, -0.2]):
         scene = box({"disk": disk(velocity)}, sides=PERIODIC, initial={"velocity": velocity})
         with prepared(scene, comm=COMM) as sim:

@@ -7,7 +7,7 @@ from step_cases import block, prepared
 from test_start import velocities
 
 from petfsi.scene.load import scene_from_dict
-from petfsi.solving.solver import Solver
+from petfsi.solving.linear import LinearSolver
 
 IMPLICIT = ["newmark", "bdf2", "midpoint"]
 RHO, STIFF, DT, SPEED, OMEGA = 1000.0, 1e14, 0.01, 1.5, 1e-3
@@ -181,7 +181,7 @@ def test_nothing_is_solved_where_supports_agree_with_what_is_given(supports, vel
     def solve(*_):
         raise AssertionError("something was solved")
 
-    monkeypatch.setattr(Solver, "solve_linear", solve)
+    monkeypatch.setattr(LinearSolver, "solve", solve)
     young = 1e3 if integrator == "symplectic-euler" else STIFF
     with prepared(box(2, supports, integrator, young=young, velocity=velocity), comm=COMM) as sim:
         assert not sim.notes

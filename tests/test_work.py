@@ -55,7 +55,7 @@ def exactly(solid, drive, damping, rate=1j * OMEGA):
     K = csr_matrix((values, pattern.indices, pattern.indptr)).toarray()
     M = np.diag(solid._elements.lumped_mass(len(rest)).ravel())
     C = damping.get("mass", 0.0) * M + a1 * K
-    X, held = np.zeros(rest.shape, dtype=complex), solid._is_held.ravel()
+    X, held = np.zeros(rest.shape, dtype=complex), solid._equation.is_held.ravel()
     if COLUMN[drive] == "boundary_work":
         X[np.isclose(solid.reference[:, 0], 1.0)] = WAY
     f = solid._loads._dead.forces(PERIOD / 4).ravel() if drive == "load" else np.zeros(rest.size)

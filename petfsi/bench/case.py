@@ -19,7 +19,7 @@ from petfsi.ranks import on_root
 from petfsi.scene.load import apply_set, scene_from_dict
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving.solver import only_options
+from petfsi.solving.option_database import only_options
 
 MONOLITHIC, SPLIT, ITERATED = "monolithic.opts", "split.opts", "split-iterated.opts"
 DIRECT = "monolithic-direct.opts"

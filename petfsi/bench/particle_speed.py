@@ -30,7 +30,7 @@ from petfsi.bench.case import Case, job
 from petfsi.bench.particles_runs import box, particles, prepared
 from petfsi.bench.report import Report, Row
 from petfsi.simulation import Simulation
-from petfsi.solving.solver import only_options
+from petfsi.solving.option_database import only_options
 
 SIZES, QUICK_SIZES = (10_000, 100_000, 1_000_000), (10_000,)
 #: Columns of 1 x 2 m in the plane, and of 1.228 x 0.55 x 1 m in space; of the beam's, so far and as high as the dam's.

@@ -13,7 +13,7 @@ from petfsi.bench.case import Case
 from petfsi.bench.particles_runs import box, largest, owned, particles, prepared, total, watched
 from petfsi.bench.report import Report, Row
 from petfsi.simulation import Simulation
-from petfsi.solving.solver import only_options
+from petfsi.solving.option_database import only_options
 
 # ---- vortices that decay ----------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from petfsi.fields.sph.fluid import SphFluid
 from petfsi.ranks import on_root
 from petfsi.scene.load import scene_from_dict
 from petfsi.simulation import Simulation
-from petfsi.solving.solver import only_options
+from petfsi.solving.option_database import only_options
 
 G, DENSITY = 9.81, 1000.0
 

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from petfsi.bench.case import MONOLITHIC, SPLIT, Case, job
 from petfsi.bench.report import Report, Row
 from petfsi.simulation import PHASES, Simulation
+from petfsi.solving.option_database import only_options
 from petfsi.solving.pressure import SHARE
-from petfsi.solving.solver import only_options
 
 SCHEMES = (MONOLITHIC, SPLIT)
 WARM_UP, STEPS = 2, 12

@@ -24,7 +24,8 @@ from petfsi.bench.report import Report, Row
 from petfsi.fields.solid import SimplexSolid
 from petfsi.runs.plan import LARGE_OPTIONS
 from petfsi.scene.load import scene_from_dict
-from petfsi.solving.solver import PREFIX, only_options
+from petfsi.solving.option_database import only_options
+from petfsi.solving.option_rules import PREFIX
 
 DT = 0.1
 #: Of 202,368 tetrahedra.

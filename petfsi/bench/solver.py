@@ -28,7 +28,7 @@ from petfsi.bench.report import Report, Row
 from petfsi.errors import SolveError
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving.solver import only_options
+from petfsi.solving.option_database import only_options
 
 PAPER = "monolithic-paper.opts"
 TOLERANCE = 1e-8
@@ -148,7 +148,7 @@ def _start(sim: Simulation) -> None:
         field.predict(sim.time, sim.dt)
     for coupling in sim.couplings:
         coupling.couple(sim.time, sim.dt)
-    sim._assemble(sim.time, sim.dt)
+    sim.equations.assemble(sim.time, sim.dt)
     if sim.solid is not None:  # nothing but round-off, yet of a stiff bar more than the flow
         sim.system.rhs.array[sim.system.piece("solid")] = 0.0
 

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from petfsi.couplings.blocks import Rows, TransferBlocks
+from petfsi.couplings.blocks import Rows
 from petfsi.couplings.enclosure import Enclosure
 from petfsi.couplings.walls import WallCoupling
 from petfsi.fields.base import Work
@@ -18,7 +18,7 @@ from petfsi.fields.solids import Forces, SolidField
 from petfsi.fields.stored import outside, refuse
 from petfsi.geometry.seams import Seams
 from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, gather_sums, gather_triplets, sum_csr
+from petfsi.petsc import gather_sums, gather_triplets, sum_csr
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
@@ -43,19 +43,13 @@ class CutCellCoupling(WallCoupling):
     symmetric = True
 
     def __init__(self, fluid: MacFluid, solid: SolidField, spec: schema.Coupling) -> None:
-        self.fluid, self.solid = fluid, solid
-        self.comm: MPI.Comm = fluid.comm
-        self.dim = fluid.dim
-        self._take(solid.surface())
+        super().__init__(fluid, solid)
         self._seams: Seams | None = None
-        self._new_blocks()
-        self._positions: np.ndarray | None = None
-        self._stale, self._dt, self._factor = False, 0.0, 0.0
+        self._factor = 0.0
         self._held = np.zeros(self.surface.point_map.shape[0])
-        self._held_outflow = np.zeros(0)
 
     def _take(self, surface: Surface) -> None:
-        self.surface = surface
+        super()._take(surface)
         # a cavity that holds nothing is no room for the fluid: without its walls it counts as solid
         wet = ~surface.void
         self.facets = surface.facets[wet]
@@ -63,15 +57,10 @@ class CutCellCoupling(WallCoupling):
         if surface.curved is not None:
             self.curved = surface.curved.take(wet)
             self.nodes = self.curved.nodes
-        # the surface's own unknowns alone, so that no product runs over all of the solid's
-        self._free = np.unique(surface.point_map.indices)
-        self._free_map = surface.point_map[:, self._free]
 
     def _new_blocks(self) -> None:
+        super()._new_blocks()
         self._made_for = self.fluid.block
-        self._transfer = TransferBlocks(self.comm, self.fluid, self.solid)
-        self.flux_block, self.force_block = self._transfer.flux, self._transfer.force
-        self.blocks = self._transfer.by_name
 
     def couple(self, time: float, dt: float) -> None:
         """Cut the grid and make J, if any point moved, and give the solid the mass of the slivers it pushes."""
@@ -101,10 +90,8 @@ class CutCellCoupling(WallCoupling):
         rows = np.repeat(walls.slot - layout.start, self.nodes.shape[1])
         shape = (layout.n_local, self._free_map.shape[0])
         self._point_flux = csr_matrix((walls.flux.ravel(), (rows, points.ravel())), shape=shape)
-        flux = (self._point_flux @ self._free_map).tocsr()
-        flux.sort_indices()
-        self.touched = np.diff(flux.indptr) > 0
-        self._flux = flux.indptr.astype(IntType), self._free[flux.indices].astype(IntType), flux.data
+        self._flux = self._flux_rows()
+        self.touched = np.diff(self._flux[0]) > 0
         if self.fluid.weight is not None:
             self._weight = self._rest_force(wet)
         self._stale = True
@@ -168,18 +155,10 @@ class CutCellCoupling(WallCoupling):
         return csr_matrix((values, indices, indptr), shape=(layout.n_local, dim))
 
     def assemble(self, time: float, dt: float) -> None:
-        """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
+        """Do what every wall does, for the fluid's present unknowns, and let slivers act on the solid. Collective."""
         if self._made_for is not self.fluid.block:  # its unknowns have changed, on all ranks
             self._new_blocks()
-        # whoever solves may scale the blocks in place, by amounts that depend on dt
-        if self._stale or dt != self._dt:
-            self.pattern_version += self._transfer.fill(*self._transfer_rows())
-            self.n_assembled += 1
-            self._stale, self._dt = False, dt
-        if self.surface.fixed_map.nnz:
-            self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
-            self._held_outflow = self._point_flux @ self._held
-            self.fluid.rhs -= self._held_outflow
+        super().assemble(time, dt)
         self.fluid.rhs[:] = self._pressed(self.fluid.rhs)
         if self.fluid.weight is not None:
             self.solid.rhs += self._weight @ self.fluid.weight.gradient
@@ -228,10 +207,6 @@ class CutCellCoupling(WallCoupling):
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the right sides. Collective."""
         self.fluid.rhs += self._pressed(volume)
-
-    def rewind(self) -> None:
-        """Make the operators anew, and the fluid's cells with them, in the next step."""
-        self._positions = None
 
     def forces(self) -> Forces:
         """Return the fluid's weight on the points that are free."""

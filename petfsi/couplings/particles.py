@@ -28,17 +28,16 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from petfsi.couplings.base import Coupling
 from petfsi.couplings.drag import Drag
+from petfsi.couplings.points import THETA, PointForces
 from petfsi.fields.base import Work
 from petfsi.fields.solids import SolidField
 from petfsi.fields.sph.fluid import SphFluid
-from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import gather_sums, gather_triplets
+from petfsi.petsc import gather_triplets
 from petfsi.scene import schema
 
 
-class PressureTransfer(Coupling):
+class PressureTransfer(PointForces):
     """Pressure (and drag) of wall particles on a solid: K_w in its block, and off the diagonal what ``drag`` says.
 
     Parameters
@@ -64,22 +63,9 @@ class PressureTransfer(Coupling):
             fluid.kept["mean_force"] = self._before
         self._lead, self._lag = 1.0, np.zeros_like(self.skin.last)
 
-    def _take(self, surface: Surface) -> None:
-        """Take the surface's maps, and their transposes for this rank's unknowns."""
-        layout = self.solid.layout
-        self.surface = surface
-        self._to_unknowns = surface.point_map[:, layout.start : layout.end].T.tocsr()
-        self._to_held = surface.fixed_map[:, layout.start : layout.end].T.tocsr()
-
     def couple(self, time: float, dt: float) -> None:
         """Bring the surface to where its velocity takes it in the step, and find the forces there. Collective."""
-        surface = self.solid.surface()
-        if surface is not self.surface:
-            self._take(surface)
-        points, velocity = self.solid.surface_present(), self.solid.surface_velocity()
-        if self.fluid.is_moving:
-            points = points + dt * velocity
-        self.skin.place(points, velocity)
+        self.skin.place(*self._arrive(dt))
         self.fluid.push(time, dt)
         # an explicit solid's block is diagonal: its step is short, and it goes without
         self._lead, self._lag = 1.0, np.zeros_like(self.skin.last)
@@ -89,14 +75,11 @@ class PressureTransfer(Coupling):
             self._lag = ratio / (1 + ratio) * self._before[1:].reshape(self._lag.shape)
         answers = self.fluid.is_moving and not self.solid.explicit
         self._answer = _Answer(self.fluid, dt if answers else 0.0)
-        self.solid.take_mass(None if self.solid.explicit else self._stiffening())
+        self.solid.take_mass(None if self.solid.explicit else self._added())
 
-    def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _added(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return this rank's rows of K_w, as far as it counts in this step, and of the drag's. Collective."""
-        rows = (self._answer.rows @ self.surface.point_map).tocsr()
-        weighted = rows.multiply(self._lead * self.theta * self._answer.weight[:, None]).tocsr()
-        product = (rows.T @ weighted).tocoo()
-        self._unknown_rows = rows
+        product = self._stiffening(self._answer.rows, self._lead * self.theta * self._answer.weight)
         i, j, values = product.row, product.col, product.data
         if self.drag is not None:
             parts = zip((i, j, values), self.drag.weigh(self.surface), strict=True)
@@ -114,19 +97,10 @@ class PressureTransfer(Coupling):
         self.n_assembled += 1
         if self.solid.explicit:
             return
-        seen = self.skin.velocity.ravel() - self.surface.fixed_map @ self.solid.fixed_velocity()
-        part = self._unknown_rows.T @ (self._lead * self.theta * self._answer.weight * (self._answer.rows @ seen))
-        here = np.flatnonzero(part)
-        self.solid.rhs += gather_sums(self.comm, self.solid.layout, here, part[here])
+        self._add_seen(self.skin.velocity.ravel())
         if self.drag is not None:
             self.pattern_version += self.drag.assemble()
             self.blocks = self.drag.blocks
-
-    def inject(self, volume: np.ndarray) -> None:
-        """Do nothing: particles fill no cells."""
-
-    def rewind(self) -> None:
-        """Forget nothing: where the surface is, is asked for in each step."""
 
     def work(self) -> Work:
         """Return what supports did against the mean force on what they hold, along its way."""
@@ -137,8 +111,7 @@ class PressureTransfer(Coupling):
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give particles what the new velocity changes, and tell the fluid where the surface is. Collective."""
-        u = np.concatenate(self.comm.allgather(values[self.solid.name]))
-        new = self.surface.point_map @ u + self.surface.fixed_map @ u
+        new = self._solved(values)
         change = self._answer.give_back(new - self.skin.velocity.ravel())
         total = np.empty_like(change)
         self.comm.Allreduce(change, total)
@@ -154,11 +127,7 @@ class PressureTransfer(Coupling):
         self.skin.place(self.solid.surface_present(), self.solid.surface_velocity())
 
 
-#: Part of the force at the end of a step in what the solid gets in it, by integrator; the rest is that at its start.
-#: Particles get half of each: with that momentum is kept to round-off where the scheme gives a force's impulse at once.
-#: Others get that at the end: midpoint blows up with halves.
-THETA = {"newmark": 0.5, "symplectic-euler": 0.5}
-#: Here bdf2 does, too: its force is put together from the means of two steps, as its momentum is from three.
+#: Here bdf2 has halves, too: its force is put together from the means of two steps, as its momentum is from three.
 MEAN = THETA | {"bdf2": 0.5}
 
 

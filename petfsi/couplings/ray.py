@@ -7,18 +7,16 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from petfsi.couplings.blocks import Rows, TransferBlocks
+from petfsi.couplings.blocks import Rows
 from petfsi.couplings.quadrature import Box, area_normals, pressure_integrals
 from petfsi.couplings.walls import WallCoupling
 from petfsi.fields.base import Work
 from petfsi.fields.mac.grid.kinds import FLUID, SOLID, SOLID_FACE, VOID
 from petfsi.fields.solids import SolidField
 from petfsi.geometry import rays
-from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, gather_triplets
+from petfsi.petsc import gather_triplets
 from petfsi.scene import schema
 
 if TYPE_CHECKING:
@@ -47,28 +45,12 @@ class RayCoupling(WallCoupling):
     """
 
     def __init__(self, fluid: MacFluid, solid: SolidField, spec: schema.Coupling) -> None:
-        self.fluid, self.solid, self.quadrature = fluid, solid, spec.quadrature
-        self.grid = fluid.grid
-        self.comm: MPI.Comm = self.grid.comm
-        self.dim = self.grid.dim
-        self.box = Box.of(self.grid)
-        self._take(solid.surface())
+        super().__init__(fluid, solid)
+        self.quadrature, self.grid, self.box = spec.quadrature, fluid.grid, Box.of(fluid.grid)
         self.wet = np.flatnonzero(~self.surface.void)
-        self._transfer = TransferBlocks(self.comm, fluid, solid)
-        self.flux_block, self.force_block = self._transfer.flux, self._transfer.force
-        self.blocks = self._transfer.by_name
         self.touched_cells: np.ndarray = self.grid.zeros_cells(dtype=bool)
-        self._positions: np.ndarray | None = None
         self._faces: list[rays.Hits] = []
-        self._rows: list[Rows] = []
-        self._stale, self._dt = False, 0.0
-        self._held = self._held_outflow = np.zeros(0)
-
-    def _take(self, surface: Surface) -> None:
-        self.surface = surface
-        # the surface's own unknowns alone, so that no product runs over all of the solid's
-        self._free = np.unique(surface.point_map.indices)
-        self._free_map = surface.point_map[:, self._free]
+        self._held = np.zeros(0)
 
     # ---- couple ---------------------------------------------------------------------------------------------
 
@@ -85,7 +67,7 @@ class RayCoupling(WallCoupling):
         self._faces = [self._solid_faces(a, hits[a], positions, shifts) for a in range(self.dim)]
         self._point_flux = self._point_fluxes()
         self.touched = self.grid.to_vec(self.touched_cells)
-        self._rows = [self._flux_rows(), self._force_rows(positions)]
+        self._rows = self._flux_rows(), self._force_rows(positions)
         self._stale = True
         self.n_coupled += 1
 
@@ -194,12 +176,6 @@ class RayCoupling(WallCoupling):
         entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
         return csr_matrix(entries, shape=(layout.n_local, self._free_map.shape[0]))
 
-    def _flux_rows(self) -> Rows:
-        """Return this rank's rows of D1 H."""
-        flux = (self._point_flux @ self._free_map).tocsr()
-        flux.sort_indices()
-        return flux.indptr.astype(IntType), self._free[flux.indices].astype(IntType), flux.data
-
     def _force_rows(self, positions: np.ndarray) -> Rows:
         """Return this rank's rows of -J. Collective."""
         facets, nodes, curved = self.surface.facets[self.wet], self.surface.nodes[self.wet], self.surface.curved
@@ -219,25 +195,12 @@ class RayCoupling(WallCoupling):
 
     # ---- assemble and accept --------------------------------------------------------------------------------
 
-    def assemble(self, time: float, dt: float) -> None:
-        """Fill the blocks if the geometry changed, and take what prescribed points let through to the right side."""
-        # whoever solves may scale the blocks in place, by amounts that depend on dt
-        if self._stale or dt != self._dt:
-            self.pattern_version += self._transfer.fill(*self._rows)
-            self.n_assembled += 1
-            self._stale, self._dt = False, dt
-        if self.surface.fixed_map.nnz:
-            self._held = self.surface.fixed_map @ self.solid.fixed_velocity()
-            self._held_outflow = self._point_flux @ self._held
-            self.fluid.rhs -= self._held_outflow
+    def _transfer_rows(self) -> tuple[Rows, Rows]:
+        return self._rows
 
     def inject(self, volume: np.ndarray) -> None:
         """Add what comes into cells from nowhere to the fluid's right side."""
         self.fluid.rhs += volume
-
-    def rewind(self) -> None:
-        """Make the operators anew, and the fluid's cells with them, in the next step."""
-        self._positions = None
 
     def power(self, pressure: np.ndarray) -> Work:
         """Return what supports do against the pressure, as the fluid feels it."""

@@ -37,14 +37,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from petfsi.couplings.base import Coupling
-from petfsi.couplings.particles import THETA
+from petfsi.couplings.points import THETA, PointForces
 from petfsi.fields.base import Work
 from petfsi.fields.solids import SolidField
 from petfsi.fields.sph.facets import contacts
 from petfsi.fields.sph.fluid import SphFluid
-from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import gather_sums, gather_triplets
+from petfsi.petsc import gather_triplets
 from petfsi.scene import schema
 
 #: The force at rest over that on what approaches with the speed of sound.
@@ -53,7 +51,7 @@ STILL = 0.01
 NEAR = 1.0
 
 
-class RepulsionTransfer(Coupling):
+class RepulsionTransfer(PointForces):
     """Repulsion between particles and the surface of a solid: a part of the solid's block, none off the diagonal.
 
     Parameters
@@ -82,13 +80,6 @@ class RepulsionTransfer(Coupling):
         self.theta = THETA.get(fluid.scene.time.integrator, 1.0)
         self._tell_of_near(points)
 
-    def _take(self, surface: Surface) -> None:
-        """Take the surface's maps, and their transposes for this rank's unknowns."""
-        layout = self.solid.layout
-        self.surface = surface
-        self._to_unknowns = surface.point_map[:, layout.start : layout.end].T.tocsr()
-        self._to_held = surface.fixed_map[:, layout.start : layout.end].T.tocsr()
-
     def _tell_of_near(self, points: np.ndarray) -> None:
         """Note how many particles begin where they are pushed off at once. Collective."""
         law, swarm = self.fluid.law, self.fluid.swarm
@@ -102,18 +93,15 @@ class RepulsionTransfer(Coupling):
 
     def couple(self, time: float, dt: float) -> None:
         """Bring the surface to where its velocity takes it in the step, and find the forces there. Collective."""
-        surface, fluid = self.solid.surface(), self.fluid
-        if surface is not self.surface:
-            self._take(surface)
-        points, velocity = self.solid.surface_present(), self.solid.surface_velocity()
-        if fluid.is_moving:
-            points = points + dt * velocity
+        fluid = self.fluid
+        points, velocity = self._arrive(dt)
         self._velocity = velocity.ravel()
         fluid.push(time, dt)
-        self._pairs = _Pairs(fluid, points, velocity, surface.facets, dt if fluid.is_moving else 0.0)
+        self._pairs = _Pairs(fluid, points, velocity, self.surface.facets, dt if fluid.is_moving else 0.0)
         self._force = self._summed(self._pairs.push(self._pairs.force))
         if not self.solid.explicit:
-            self.solid.take_mass(self._stiffening())
+            product = self._stiffening(self._pairs.rows, self.theta * self._pairs.weight)
+            self.solid.take_mass(gather_triplets(self.comm, self.solid.layout, product.row, product.col, product.data))
 
     def _summed(self, part: np.ndarray) -> np.ndarray:
         """Return the sum over ranks of forces on points, shape (n_points, dim), N; add up who is behind. Collective."""
@@ -121,14 +109,6 @@ class RepulsionTransfer(Coupling):
         self.comm.Allreduce(MPI.IN_PLACE, total)
         self.fluid.tallied["particles_behind"] = float(total[-1])
         return total[:-1].reshape(self.last.shape)
-
-    def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return this rank's rows of what stands in the solid's block, as far as it counts in this step. Collective."""
-        rows = (self._pairs.rows @ self.surface.point_map).tocsr()
-        weighted = rows.multiply(self.theta * self._pairs.weight[:, None]).tocsr()
-        product = (rows.T @ weighted).tocoo()
-        self._unknown_rows = rows
-        return gather_triplets(self.comm, self.solid.layout, product.row, product.col, product.data)
 
     def assemble(self, time: float, dt: float) -> None:
         """Add the force of the step to the solid's right-hand side, at the velocity that it saw. Collective."""
@@ -139,17 +119,8 @@ class RepulsionTransfer(Coupling):
             self.last[...] = self._force
         self.solid.rhs += self._to_unknowns @ self._mean.ravel()
         if not self.solid.explicit:
-            seen = self._velocity - self.surface.fixed_map @ self.solid.fixed_velocity()
-            part = self._unknown_rows.T @ (self.theta * self._pairs.weight * (self._pairs.rows @ seen))
-            here = np.flatnonzero(part)
-            self.solid.rhs += gather_sums(self.comm, self.solid.layout, here, part[here])
+            self._add_seen(self._velocity)
         self.n_assembled += 1
-
-    def inject(self, volume: np.ndarray) -> None:
-        """Do nothing: particles fill no cells."""
-
-    def rewind(self) -> None:
-        """Forget nothing: where the surface is, is asked for in each step."""
 
     def work(self) -> Work:
         """Return what supports did against the mean force on what they hold, along its way, and what pairs took.
@@ -163,8 +134,7 @@ class RepulsionTransfer(Coupling):
 
     def accept(self, values: Mapping[str, np.ndarray], time: float, dt: float) -> None:
         """Give particles what the new velocity changes. Collective."""
-        u = np.concatenate(self.comm.allgather(values[self.solid.name]))
-        new = self.surface.point_map @ u + self.surface.fixed_map @ u
+        new = self._solved(values)
         more = 0.0 if self.solid.explicit else self._pairs.weight * (self._pairs.rows @ (new - self._velocity))
         change = self._summed(self._pairs.push(more + np.zeros_like(self._pairs.force)))
         self._mean = self._mean + self.theta * change

@@ -6,20 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
-from scipy.sparse import csr_matrix, vstack
 
 from petfsi.errors import InputError
 from petfsi.fields.base import Stock, Work
 from petfsi.fields.slabs import Reader, Slab
+from petfsi.fields.solid.equations.mass import AddedRows, Rows
 from petfsi.fields.solid.field import NodalSolid
-from petfsi.fields.solid.mass import AddedRows, Rows
-from petfsi.fields.solid.partition import Fetch, slab
 from petfsi.fields.solids import Forces, Landing, SolidField
+from petfsi.fields.stacked import Stack, joined_surface, stacked_numbers
 from petfsi.geometry.bodies import build_bodies
-from petfsi.geometry.quadratic import Curved
 from petfsi.geometry.surfaces import Surface
-from petfsi.petsc import IntType, Layout, new_block, set_csr
+from petfsi.petsc import IntType, Layout, new_block, set_csr, set_near_null_space
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
 
@@ -70,7 +67,7 @@ class JointSolid(SolidField):
         ends = np.cumsum(counts)
         self._pieces = [slice(end - n, end) for end, n in zip(ends, counts, strict=True)]
         self.layout = Layout.of(comm, int(ends[-1]))
-        self._number = _stacked_numbers(comm, counts)
+        self._number = stacked_numbers(comm, counts)
         self.rhs = np.zeros(self.layout.n_local)
         self.moved = np.zeros(self.layout.n_local)
         acting = {name for part in self.parts for name in part.acting}
@@ -104,11 +101,8 @@ class JointSolid(SolidField):
         set_csr(self.block, self._indptr, self._indices, self._values, new_pattern=True)
         self._added = AddedRows(self.comm)
         self._assembled = [0] * (len(self.parts) + 1)
-        vectors = []
-        for modes in zip(*(part.near_null_space() for part in self.parts), strict=True):
-            vectors.append(self.block.createVecRight())
-            vectors[-1].setArray(np.concatenate(modes))
-        self.block.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=self.comm))
+        modes = zip(*(part.near_null_space() for part in self.parts), strict=True)
+        set_near_null_space(self.block, [np.concatenate(mode) for mode in modes])
 
     def _split(self, x: np.ndarray) -> list[tuple[NodalSolid, np.ndarray]]:
         return [(part, x[piece]) for part, piece in zip(self.parts, self._pieces, strict=True)]
@@ -252,29 +246,9 @@ class JointSolid(SolidField):
         surfaces = [part.surface() for part in self.parts]
         known = zip(surfaces, self._surfaces, strict=False)
         if self._surface is None or any(new is not old for new, old in known):
-            self._surfaces, self._surface = surfaces, self._joined(surfaces)
+            self._surfaces = surfaces
+            self._surface = joined_surface(surfaces, self._number, self.layout.n_global)
         return self._surface
-
-    def _joined(self, surfaces: list[Surface]) -> Surface:
-        first = np.cumsum([0] + [surface.n_points for surface in surfaces])
-        facets = [s.facets + n for s, n in zip(surfaces, first, strict=False)]
-        curved = [s.curved and s.curved._replace(nodes=s.nodes + n) for s, n in zip(surfaces, first, strict=False)]
-        return Surface(
-            facets=np.concatenate(facets),
-            cavity=np.concatenate([s.cavity for s in surfaces]),
-            void=np.concatenate([s.void for s in surfaces]),
-            point_map=self._joined_map([s.point_map for s in surfaces]),
-            fixed_map=self._joined_map([s.fixed_map for s in surfaces]),
-            curved=Curved.joined(list(zip(facets, curved, strict=True))),
-        )
-
-    def _joined_map(self, maps: list[csr_matrix]) -> csr_matrix:
-        n = self.layout.n_global
-        renumbered = [
-            csr_matrix((m.data, number[m.indices], m.indptr), shape=(m.shape[0], n))
-            for m, number in zip(maps, self._number, strict=True)
-        ]
-        return vstack(renumbered, format="csr")
 
     def surface_bodies(self) -> np.ndarray:
         """Return the body of each of its points as numbered in the scene."""
@@ -364,14 +338,14 @@ class JointSolid(SolidField):
         """Return what the parts give, points and cells of one after those of the other. Collective."""
         outputs = [part.output() for part in self.parts]
         if not self._static:
-            self._points = _Stack(self.comm, [out["points"] for out in outputs])
+            self._points = Stack(self.comm, [out["points"] for out in outputs])
             self._static = {"points": self._points([out["points"] for out in outputs]), **self._cells(outputs)}
         changing = [name for name in outputs[0] if name not in self._static]
         return self._static | {name: self._points([out[name] for out in outputs]) for name in changing}
 
     def _cells(self, outputs: list[dict[str, Slab]]) -> dict[str, Slab]:
         """Return cells by points of all parts, and their bodies as numbered in the scene. Collective."""
-        stack = _Stack(self.comm, [out["cells"] for out in outputs])
+        stack = Stack(self.comm, [out["cells"] for out in outputs])
         first = np.cumsum([0] + [out["points"].shape[0] for out in outputs])
         cells, body = [], []
         for part, out, n in zip(self.parts, outputs, first, strict=False):
@@ -406,47 +380,3 @@ class JointSolid(SolidField):
 def _prefixed(read: Reader, kind: str) -> Reader:
     """Return the reader of the arrays of one kind."""
     return lambda name, start, count: read(f"{kind}_{name}", start, count)
-
-
-class _Stack:
-    """Puts rows of several global arrays one array after the other, and cuts them anew: a share for each rank.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-    slabs : list of Slab
-        Pieces of the arrays, cut as those that are given later.
-    """
-
-    def __init__(self, comm: MPI.Comm, slabs: list[Slab]):
-        counts = [len(piece.data) for piece in slabs]
-        self._n = sum(piece.shape[0] for piece in slabs)
-        self._begin, end = slab(self._n, comm.rank, comm.size)
-        held = np.concatenate(_stacked_numbers(comm, counts))
-        self._fetch = Fetch(comm, Layout.of(comm, sum(counts)), held[self._begin : end])
-
-    def __call__(self, slabs: list[Slab]) -> Slab:
-        """Return this rank's piece of the whole. Collective."""
-        like = slabs[0]
-        data = self._fetch(np.concatenate([piece.data for piece in slabs]))
-        return Slab(data, (self._begin, *like.start[1:]), (self._n, *like.shape[1:]))
-
-
-def _stacked_numbers(comm: MPI.Comm, counts: list[int]) -> list[np.ndarray]:
-    """Return the joint numbers of each part's things, numbered rank after rank and on each part after part. Collective.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-    counts : list of int
-        How many of each part this rank holds; a part's own numbers run rank after rank.
-
-    Returns
-    -------
-    list of ndarray of IntType
-        Ascending, by the part's own number.
-    """
-    every = np.array(comm.allgather(counts))
-    first = (np.cumsum(every) - every.ravel()).reshape(every.shape)
-    shift = first - (np.cumsum(every, axis=0) - every)
-    return [(np.arange(n.sum()) + np.repeat(by, n)).astype(IntType) for n, by in zip(every.T, shift.T, strict=True)]

@@ -141,15 +141,9 @@ def cut(
     seams : Seams, optional
         Where surfaces reach around periodic axes; their points must be ``closed``. The answer knows the walls alone.
     """
-    dim = points.shape[1]
+    dim, every = points.shape[1], facets
     dx = np.asarray(lattice.dx, dtype=float)
-    x = (np.asarray(points, dtype=float) - np.asarray(lattice.origin)) / dx
-    ends, every, place = [facets[:0]] * dim, facets, None
-    if seams is not None:
-        part = None if part is None else part[seams.walls]
-        ends, facets = [facets[cap].astype(np.int32) for cap in seams.caps], facets[seams.walls]
-        x, place = overlapped(x, facets, seams, np.asarray(lattice.cells) * lattice.periodic), seams.place
-    x = off_planes(x, facets, place)
+    x, facets, ends = _placed(points, facets, lattice, seams)
     area = area_vectors(x * dx, facets)
     size = np.linalg.norm(area, axis=1, keepdims=True)
     lo, hi = (np.asarray(end, dtype=np.int64) for end in (lattice.lo, lattice.hi))
@@ -177,9 +171,9 @@ def cut(
     volume = _volumes(patches, frame, opening[-1])
     some = np.flatnonzero(inner & np.any(patches.vectors != 0.0, axis=1))
     integrals = integrals[order[some]]
-    moments = integrals[:, dim:].reshape(-1, dim, dim)
-    integrals = integrals[:, :dim]
+    integrals, moments = integrals[:, :dim], integrals[:, dim:].reshape(-1, dim, dim)
     if part is not None:
+        part = part if seams is None else part[seams.walls]
         place = np.column_stack(np.unravel_index(patches.cell[some], shape)) + frame.lo - images[patches.image[some]]
         of = (frame, patches.facet[some], place)
         shapes = (np.full(len(some), -1), np.zeros((0, 2, 2 * dim)))
@@ -205,6 +199,21 @@ def cut(
         link_open=pieces.link_open,
         points=np.asarray(lattice.origin) + dx * x,
     )
+
+
+def _placed(
+    points: np.ndarray, facets: np.ndarray, lattice: Lattice, seams: Seams | None
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return where a surface is cut, in cells from the lattice's origin, its walls, and its lower ends along each axis.
+
+    Points are moved a little from planes of the lattice. A surface that reaches around no periodic axis has no ends.
+    """
+    x = (np.asarray(points, dtype=float) - np.asarray(lattice.origin)) / np.asarray(lattice.dx, dtype=float)
+    ends, place = [facets[:0]] * points.shape[1], None
+    if seams is not None:
+        ends, facets = [facets[cap].astype(np.int32) for cap in seams.caps], facets[seams.walls]
+        x, place = overlapped(x, facets, seams, np.asarray(lattice.cells) * lattice.periodic), seams.place
+    return off_planes(x, facets, place), facets, ends
 
 
 def _reach(

@@ -9,7 +9,7 @@ from numba import njit
 
 from petfsi.geometry.links import Split
 from petfsi.geometry.patches import Frame, Patches, measure_polygon, measure_segment
-from petfsi.geometry.piece_accounts import CLOSED, Box, account, count_parts, places
+from petfsi.geometry.piece_accounts import CLOSED, Box, account, count_parts, enter_elements, places
 from petfsi.geometry.unions import union_2d
 from petfsi.geometry.unions_3d import union_3d
 
@@ -84,7 +84,7 @@ def _split_overlapping(x, facets, beyond, box, facet, image, cell, parts, ranges
     integrals, vectors = np.empty((room, dim * (dim + 1))), np.empty((room, dim + 1))
     extras, opened = np.empty((room, 3)), np.maximum(openings, 0.0)
     polygons = np.empty((room, 2 * (dim - 1), 2 * dim))
-    centre, done = np.full(dim, -0.5), np.ones(len(ranges), np.bool_)
+    done = np.ones(len(ranges), np.bool_)
     n_split = n_extra = total = n_rest = 0
     for r in range(len(ranges)):
         first, last = ranges[r]
@@ -103,13 +103,8 @@ def _split_overlapping(x, facets, beyond, box, facet, image, cell, parts, ranges
         state = np.zeros(len(parent) - m, np.int64)
         for e in range(len(elements)):
             state[int(elements[e, 1]) - m] = 1
-        for k in range(m):
-            normal = frame.normals[facet[first + patch[k]]]
-            integral, vector = integrals[n_rest + k], vectors[n_rest + k]
-            if beyond is None:
-                measure_segment(kept[k], centre, frame.dx, normal, integral, vector)
-            else:
-                measure_polygon(kept[k], 4, centre, frame.dx, normal, integral, vector)
+        measured = integrals[n_rest : n_rest + m], vectors[n_rest : n_rest + m]
+        _measure(beyond, kept, facet[first:last][patch], frame, *measured)
         n, volume, piece = 0, np.zeros(0), np.zeros(0, np.int64)
         if good and len(parent) > 0:
             n, piece, volume = account(elements, parent, state, np.arange(m), m, vectors[n_rest : n_rest + m], shown)
@@ -127,13 +122,9 @@ def _split_overlapping(x, facets, beyond, box, facet, image, cell, parts, ranges
         if n <= 1:
             continue
         cells[n_split], n_pieces[n_split] = cell[first], n
-        for face in range(2 * dim):
-            for e in range(len(elements)):
-                if elements[e, 0] == face:
-                    pieces[total], areas[total], keys[total] = piece[int(elements[e, 1])], elements[e, 2], key[e]
-                    total += 1
-            start[2 * dim * n_split + face + 1] = total
-        n_split += 1
+        of_faces = start[2 * dim * n_split : 2 * dim * (n_split + 1) + 1]
+        enter_elements(elements, key, piece, of_faces, pieces, areas, keys)
+        n_split, total = n_split + 1, of_faces[-1]
         while n_extra + n > len(extras):
             extras = _doubled(extras)
         for i in range(1, n):
@@ -144,6 +135,18 @@ def _split_overlapping(x, facets, beyond, box, facet, image, cell, parts, ranges
     )  # fmt: skip
     rest = (rest_patch[:n_rest], rest_piece[:n_rest], integrals[:n_rest], vectors[:n_rest], polygons[:n_rest])
     return split, rest, extras[:n_extra], opened, done
+
+
+@njit(cache=True)
+def _measure(beyond, kept, facet, frame, integrals, vectors):
+    """Write the integrals and area vectors of what is left of some patches, each of its ``facet``."""
+    centre = np.full(len(frame.dx), -0.5)
+    for k in range(len(kept)):
+        normal = frame.normals[facet[k]]
+        if beyond is None:
+            measure_segment(kept[k], centre, frame.dx, normal, integrals[k], vectors[k])
+        else:
+            measure_polygon(kept[k], 4, centre, frame.dx, normal, integrals[k], vectors[k])
 
 
 @njit(cache=True)

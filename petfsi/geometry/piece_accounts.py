@@ -127,6 +127,30 @@ def count_parts(first_patch):
 
 
 @njit(cache=True)
+def enter_elements(elements, key, piece, start, pieces, areas, keys):
+    """Enter the elements of a cell's faces behind those of other cells, face after face.
+
+    Parameters
+    ----------
+    elements, key
+        As ``walk_2d`` returns them.
+    piece : ndarray of int
+        That of each node.
+    start : ndarray of int64, shape (2 dim + 1,)
+        Where each face's elements begin; all but the first are set.
+    pieces, areas, keys : ndarray
+        What is entered of each: its piece, its area, its key.
+    """
+    total = start[0]
+    for face in range(len(start) - 1):
+        for e in range(len(elements)):
+            if elements[e, 0] == face:
+                pieces[total], areas[total], keys[total] = piece[int(elements[e, 1])], elements[e, 2], key[e]
+                total += 1
+        start[face + 1] = total
+
+
+@njit(cache=True)
 def places(cell, box):
     """Return where a cell lies as each image of the surface sees it."""
     at = np.empty(box.images.shape, np.int64)

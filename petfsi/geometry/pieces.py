@@ -11,7 +11,7 @@ from petfsi.geometry.links import Split, link_pieces
 from petfsi.geometry.neighbours import Neighbours, connected_parts
 from petfsi.geometry.overlaps import Rest, joined, split_overlapping
 from petfsi.geometry.patches import Frame, Patches
-from petfsi.geometry.piece_accounts import CLOSED, Box, account, count_parts, places
+from petfsi.geometry.piece_accounts import CLOSED, Box, account, count_parts, enter_elements, places
 from petfsi.geometry.planes import overlap_3d, polygons_of
 from petfsi.geometry.unions import ends_2d, overlap_2d
 from petfsi.geometry.walks import walk_2d
@@ -159,6 +159,22 @@ def cells_in_doubt(cell, parts, inner, overcovered):
 
 
 @njit(cache=True)
+def _overlap(beyond, x, facets, at, facet, image, part):
+    """Return whether patches of several parts of the surface cross in a cell; ``beyond`` as for ``split_cells``."""
+    if beyond is None:  # told apart when compiled: the others are not
+        return overlap_2d(ends_2d(x, facets, at, facet, image)[0], part)
+    return overlap_3d(polygons_of(x, facets, at, facet, image), part)
+
+
+@njit(cache=True)
+def _walk(beyond, n_parts, opening, x, facets, at, facet, image, part):
+    """Return what bounds a cell's fluid as ``walk_2d`` and ``walk_3d`` do."""
+    if beyond is None:
+        return walk_2d(x, facets, at, facet, image, part, n_parts, opening)
+    return walk_3d(x, facets, at, facet, image, part, n_parts, opening, beyond)
+
+
+@njit(cache=True)
 def split_cells(x, facets, beyond, shell, box, facet, image, cell, parts, vectors, ranges, openings):
     """Return the split cells, the piece of each patch, the extra pieces, and the cells in which solids overlap.
 
@@ -202,21 +218,11 @@ def split_cells(x, facets, beyond, shell, box, facet, image, cell, parts, vector
         several = False
         for p in range(first + 1, last):
             several = several or image[p] != image[first] or shell[facet[p]] != shell[facet[first]]
-        if several and not overlapping[r]:
-            if beyond is None:  # told apart when compiled: the others are not
-                overlapping[r] = overlap_2d(ends_2d(x, facets, at, facet[first:last], image[first:last])[0], part)
-            else:
-                overlapping[r] = overlap_3d(polygons_of(x, facets, at, facet[first:last], image[first:last]), part)
+        here = (x, facets, at, facet[first:last], image[first:last], part)
+        overlapping[r] = overlapping[r] or (several and _overlap(beyond, *here))
         if overlapping[r]:
             continue
-        if beyond is None:
-            parent, state, elements, key, good = walk_2d(
-                x, facets, at, facet[first:last], image[first:last], part, n_parts, openings[r]
-            )
-        else:
-            parent, state, elements, key, good = walk_3d(
-                x, facets, at, facet[first:last], image[first:last], part, n_parts, openings[r], beyond
-            )
+        parent, state, elements, key, good = _walk(beyond, n_parts, openings[r], *here)
         n = 0
         if good:
             n, piece, volume = account(elements, parent, state, part, n_parts, vectors[first:last], openings[r])
@@ -226,22 +232,13 @@ def split_cells(x, facets, beyond, shell, box, facet, image, cell, parts, vector
         cells[n_split], n_pieces[n_split] = cell[first], n
         for p in range(first, last):
             patch_piece[p] = piece[part[p - first]]
-        for face in range(2 * dim):
-            for e in range(len(elements)):
-                if elements[e, 0] == face:
-                    pieces[total], areas[total], keys[total] = piece[int(elements[e, 1])], elements[e, 2], key[e]
-                    total += 1
-            start[2 * dim * n_split + face + 1] = total
-        n_split += 1
+        of_faces = start[2 * dim * n_split : 2 * dim * (n_split + 1) + 1]
+        enter_elements(elements, key, piece, of_faces, pieces, areas, keys)
+        n_split, total = n_split + 1, of_faces[-1]
         for i in range(1, n):
             extras[n_extra, 0], extras[n_extra, 1], extras[n_extra, 2] = cell[first], i, volume[i]
             n_extra += 1
     split = Split(
-        cells[:n_split],
-        n_pieces[:n_split],
-        start[: 2 * dim * n_split + 1],
-        pieces[:total],
-        areas[:total],
-        keys[:total],
-    )
+        cells[:n_split], n_pieces[:n_split], start[: 2 * dim * n_split + 1], pieces[:total], areas[:total], keys[:total]
+    )  # fmt: skip
     return split, patch_piece, extras[:n_extra], overlapping

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,6 +12,7 @@ from petfsi.errors import InputError
 from petfsi.geometry.groups import cell_groups, point_groups
 from petfsi.geometry.mesh_cells import body_blocks
 from petfsi.geometry.mesh_files import open_mesh
+from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, simplices
@@ -88,6 +90,16 @@ def _simplices(mesh: meshio.Mesh, n: int, number: np.ndarray, chosen: np.ndarray
     """Return the simplices of some cells of a block, renumbered."""
     kind = KINDS[mesh.cells[n].type]
     return simplices(number[np.asarray(mesh.cells[n].data)[chosen, : kind.corners]], kind.dim)[0]
+
+
+def tags_of_bodies(solids: Mapping[str, Solid], mesh: SimplexMesh, directory: Path) -> dict[str, Tags]:
+    """Return the groups that the scene names, by body; numbers are those of the body's own nodes. Not collective."""
+    found = {}
+    for body, (name, solid) in enumerate(solids.items()):
+        tags = read_tags(solid, mesh.points.shape[1], f"solids.{name}", directory)
+        elements = mesh.elements(body)
+        found[name] = with_middles(tags, elements - elements.min()) if tags else tags
+    return found
 
 
 def with_middles(tags: Tags, elements: np.ndarray) -> Tags:

@@ -103,48 +103,16 @@ def union_2d(x, facets, cells, facet, image, part, covered):
         if outside == 0:
             kept[k] = n_kept
             n_kept += 1
-    n_stretches = len(at) + 4
-    parent = np.arange(n_kept + n_stretches)
-    # where kept parts end they join, or an open stretch
-    for k in range(n_parts):
-        if kept[k] < 0:
-            continue
-        for i in range(2):
-            _join_end_2d(parts, k, i, kept, parent)
-    for c in range(len(at)):
-        face, place = on_face[c], 0
-        if face < 0:
-            continue
-        while order[face, place] != c:
-            place += 1
-        k = start[c // 2] if c % 2 == 0 else start[c // 2 + 1] - 1
-        for j in (place, place + 1):
-            if kept[k] >= 0 and depth[face, j] == 0:
-                join(parent, kept[k], n_kept + _stretch_number(count, face, j))
-    # faces meet in the cell's corners
-    for corner in range(4):
-        one, other = corner & 1, 2 + (corner >> 1)
-        j = count[one] if corner >> 1 else 0
-        m = count[other] if corner & 1 else 0
-        if depth[one, j] == 0 and depth[other, m] == 0:
-            join(parent, n_kept + _stretch_number(count, one, j), n_kept + _stretch_number(count, other, m))
+    parent = np.arange(n_kept + len(at) + 4)
+    _join_parts_2d(parts, start, kept, parent, on_face, order, depth, count, n_kept)
+    _join_corners_2d(parent, depth, count, n_kept)
     _join_loops_2d(parts, kept, parent, on_face, at, order, count, depth, n_kept)
-    elements, keys = np.empty((n_stretches, 3)), np.empty(n_stretches, np.int64)
-    m, opened = 0, np.zeros(4)
-    for face in range(4):
-        for j in range(count[face] + 1):
-            if depth[face, j] == 0:
-                low = -0.5 if j == 0 else at[order[face, j - 1]]
-                high = 0.5 if j == count[face] else at[order[face, j]]
-                elements[m, 0], elements[m, 1] = face, n_kept + _stretch_number(count, face, j)
-                elements[m, 2], keys[m] = high - low, j
-                opened[face] += high - low
-                m += 1
+    elements, keys, opened = _open_stretches_2d(at, order, depth, count, n_kept)
     rest, patch = np.empty((n_kept, 2, 4)), np.empty(n_kept, np.int64)
     for k in range(n_parts):
         if kept[k] >= 0:
             rest[kept[k]], patch[kept[k]] = parts[k], of[k]
-    return parent, rest, patch, elements[:m].copy(), keys[:m].copy(), opened, good
+    return parent, rest, patch, elements, keys, opened, good
 
 
 @njit(cache=True)
@@ -267,6 +235,55 @@ def _outside_2d(parts, ends, k, p, on_face, at, sign, order, depth):
     if out < 0.0:
         level -= 1
     return level, level >= 0
+
+
+@njit(cache=True)
+def _join_parts_2d(parts, start, kept, parent, on_face, order, depth, count, n_kept):
+    """Join kept parts with each other where they end, or with the open stretches that they end at."""
+    for k in range(len(parts)):
+        if kept[k] < 0:
+            continue
+        for i in range(2):
+            _join_end_2d(parts, k, i, kept, parent)
+    for c in range(len(on_face)):
+        face, place = on_face[c], 0
+        if face < 0:
+            continue
+        while order[face, place] != c:
+            place += 1
+        k = start[c // 2] if c % 2 == 0 else start[c // 2 + 1] - 1
+        for j in (place, place + 1):
+            if kept[k] >= 0 and depth[face, j] == 0:
+                join(parent, kept[k], n_kept + _stretch_number(count, face, j))
+
+
+@njit(cache=True)
+def _join_corners_2d(parent, depth, count, n_kept):
+    """Join the open stretches of faces that meet in the cell's corners."""
+    for corner in range(4):
+        one, other = corner & 1, 2 + (corner >> 1)
+        j = count[one] if corner >> 1 else 0
+        m = count[other] if corner & 1 else 0
+        if depth[one, j] == 0 and depth[other, m] == 0:
+            join(parent, n_kept + _stretch_number(count, one, j), n_kept + _stretch_number(count, other, m))
+
+
+@njit(cache=True)
+def _open_stretches_2d(at, order, depth, count, n_kept):
+    """Return the open stretches as ``elements`` and ``keys`` of ``union_2d``, and how much of each face they are."""
+    n_stretches = len(at) + 4
+    elements, keys = np.empty((n_stretches, 3)), np.empty(n_stretches, np.int64)
+    m, opened = 0, np.zeros(4)
+    for face in range(4):
+        for j in range(count[face] + 1):
+            if depth[face, j] == 0:
+                low = -0.5 if j == 0 else at[order[face, j - 1]]
+                high = 0.5 if j == count[face] else at[order[face, j]]
+                elements[m, 0], elements[m, 1] = face, n_kept + _stretch_number(count, face, j)
+                elements[m, 2], keys[m] = high - low, j
+                opened[face] += high - low
+                m += 1
+    return elements[:m].copy(), keys[:m].copy(), opened
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from petfsi.notes.forms import SLENDER, Form
+from petfsi.notes.forms import SLENDER, Bend, Form
 from petfsi.scene.solids import Solid
 
 #: c of the slowest bending that is no rigid motion, by how the ends are held, in the order of the alphabet.
@@ -159,14 +159,11 @@ def carried(form: Form, density: float, fluid: float) -> float:
     return math.pi / 4 * fluid * float(form.lengths[1]) / (density * form.thickness)
 
 
-def excess(solid: Solid, form: Form, volumetric: str, axis: int = -1) -> float:
-    """Return by which part linear elements bend too stiffly, to a factor of two.
-
-    ``volumetric`` is as in a scene, ``axis`` that of the form along which it bends.
-    """
+def excess(solid: Solid, bend: Bend, dim: int, volumetric: str) -> float:
+    """Return by which part linear elements bend too stiffly, to a factor of two; ``volumetric`` is as in a scene."""
     a, b = TOO_STIFF[volumetric]
-    size = a + b * float(form.spacing[axis] / form.spacing[0]) ** 2
+    size = a + b * bend.ratio**2
     if volumetric == "full":
-        bulk = BULK_3D if len(form.axes) == 3 else BULK_2D if solid.shape.mesh is not None else 0.0
+        bulk = BULK_3D if dim == 3 else BULK_2D if solid.shape.mesh is not None else 0.0
         size += bulk * 2 * solid.poisson / (1 - 2 * solid.poisson)
-    return size / form.across**2
+    return size / bend.across**2

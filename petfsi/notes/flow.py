@@ -17,7 +17,7 @@ from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.fluid_kinds import Fluid
 from petfsi.scene.fluids import MacFluid
 from petfsi.scene.shape_checks import OPPOSITE
-from petfsi.scene.sides import Inflow, InflowSide
+from petfsi.scene.sides import Inflow, InflowSide, open_side
 from petfsi.scene.tables import Number
 
 #: Cells that a body should have across it.
@@ -44,11 +44,12 @@ def resolution(view: View) -> Notes:
         across = _across(form, cell)
         if across.min() >= ENOUGH - _ROUND_OFF:
             continue
-        said = f"solids.{name} is {across.min():.2g} of the fluid's {unit} across"
-        if np.sort(across)[1] < ENOUGH - _ROUND_OFF:
-            finer = ENOUGH / np.sort(across)[1]
+        said, second = f"solids.{name} is {across.min():.2g} of the fluid's {unit} across", np.sort(across)[1]
+        if second < ENOUGH - _ROUND_OFF:
+            finer = ENOUGH / second
             yield Note(
-                f"{said}, where {ENOUGH:g} are few: forces on it are coarse; {finer:.2g} times finer {key} help",
+                f"solids.{name} is {second:.2g} of the fluid's {unit} across, where {ENOUGH:g} are few: forces on it "
+                f"are coarse; {finer:.2g} times finer {key} help",
                 warns=True,
             )
         elif scene.transfer == "ray":
@@ -76,6 +77,21 @@ def _across(form: Form, cell: np.ndarray) -> np.ndarray:
     """Return how many cells a solid, of a hollow one its wall, is across along each of its axes."""
     lengths = np.concatenate(([form.thickness], form.lengths[1:]))
     return lengths * np.linalg.norm(form.axes / cell, axis=1)
+
+
+def nowhere_to_go(view: View) -> Notes:
+    """Warn of a jet into a box that no side opens: where no solid could give way either, that is an error."""
+    scene = view.scene
+    if not isinstance(scene.fluid, MacFluid) or not scene.solids:
+        return
+    sides = {side: getattr(scene.fluid.sides, side) for pair in OPPOSITE[: scene.dim] for side in pair}
+    jets = [side for side, form in sides.items() if isinstance(form, InflowSide)]
+    if len(jets) == 1 and not any(open_side(form) for form in sides.values()):
+        yield Note(
+            f"fluid.sides.{jets[0]}: what comes in can leave nowhere, as no side is open; solids alone give way to it, "
+            f'until they are squeezed to nothing; let another side be "open"',
+            warns=True,
+        )
 
 
 # ---- speeds -------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,13 @@ STAND_INS = {2: 200, 3: 40}
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
+class Bend(NamedTuple):
+    """How linear elements lie in what bends: how many across it, and how many times as long along it as thick."""
+
+    across: float
+    ratio: float
+
+
 @dataclass(frozen=True)
 class Form:
     """The box that a solid is, or about is; axes are in the order of their lengths.
@@ -40,6 +48,8 @@ class Form:
         Of its material where it is thinnest, m: of walls, if it is hollow.
     filled : bool
         Whether it is a box and no more.
+    wall : Bend or None
+        Of the thinnest wall of a hollow one that is long enough to bend.
     points : ndarray, shape (n, dim)
         Nodes, of a large box some of them, m.
     """
@@ -51,16 +61,16 @@ class Form:
     thickness: float
     filled: bool
     points: np.ndarray
+    wall: Bend | None = None
 
     @property
     def slender(self) -> bool:
         """Whether it may bend as a beam does."""
         return self.filled and bool(self.lengths[-1] >= SLENDER * self.thickness)
 
-    @property
-    def across(self) -> float:
-        """How many elements there are across its thickness."""
-        return float(self.thickness / self.spacing[0])
+    def bend(self, axis: int) -> Bend:
+        """Return how elements lie in it as it bends along an axis."""
+        return Bend(float(self.thickness / self.spacing[0]), float(self.spacing[axis] / self.spacing[0]))
 
 
 def form_of(solid: Solid, dim: int, mesh: Mesh | None) -> Form | None:
@@ -81,21 +91,50 @@ def _box(box: Box, cavity: Box | None) -> Form:
     ends = [np.linspace(o, o + s, min(n, most) + 1) for o, s, n in zip(box.origin, box.size, cells, strict=True)]
     points = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, len(size))
     order = np.argsort(size, kind="stable")
-    thickness = float(size.min())
-    if cavity is not None:
-        low = np.array(box.origin, dtype=float)
-        inner = np.array(cavity.origin, dtype=float)
-        walls = np.concatenate((inner - low, low + size - inner - cavity.size))
-        thickness = float(min([wall for wall in walls if wall > 0], default=thickness))
+    spacing = size / cells
+    left_out = [] if cavity is None else _left_out(box, cavity)
+    walls = _walls(spacing, cells, left_out) if left_out else []
     return Form(
         axes=np.eye(len(size))[order],
         lengths=size[order],
-        spacing=(size / cells)[order],
+        spacing=spacing[order],
         altitude=float(np.sum((cells / size) ** 2) ** -0.5),
-        thickness=thickness,
-        filled=cavity is None,
+        thickness=min([wall.thickness for wall in walls], default=float(size.min())),
+        filled=not left_out,
         points=points,
+        wall=next((wall.bend for wall in sorted(walls) if wall.length >= SLENDER * wall.thickness), None),
     )
+
+
+class _Wall(NamedTuple):
+    """A wall of a hollow box: its thickness, the longest side of what it bounds, m, and its elements."""
+
+    thickness: float
+    length: float
+    bend: Bend
+
+
+def _left_out(box: Box, cavity: Box) -> list[np.ndarray]:
+    """Return which cells along each axis have their centres in a cavity, as the box's mesh has; nothing if none has."""
+    found = []
+    for o, size, n, low, wide in zip(box.origin, box.size, box.cells or (), cavity.origin, cavity.size, strict=True):
+        centre = o + size / n * (np.arange(n) + 0.5)
+        found.append(np.flatnonzero((centre >= low) & (centre <= low + wide)))
+    return found if all(len(cells) for cells in found) else []
+
+
+def _walls(spacing: np.ndarray, cells: np.ndarray, left_out: list[np.ndarray]) -> list[_Wall]:
+    """Return the walls around what is left out; where that reaches a side there is none."""
+    sides = np.array([len(out) for out in left_out]) * spacing
+    walls = []
+    for axis, out in enumerate(left_out):
+        others = [n for n in range(len(spacing)) if n != axis]
+        along = max(others, key=lambda n: sides[n])
+        for n in (int(out[0]), int(cells[axis] - 1 - out[-1])):
+            if n:
+                bend = Bend(float(n), float(spacing[along] / spacing[axis]))
+                walls.append(_Wall(float(n * spacing[axis]), float(sides[along]), bend))
+    return walls
 
 
 def _ball(ball: Ball) -> Form:

@@ -17,6 +17,7 @@ NOTES: tuple[Callable[[View], Notes], ...] = (
     solids.locking,
     solids.swings,
     flow.resolution,
+    flow.nowhere_to_go,
     flow.courant,
     flow.masses,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from petfsi.notes.bending import bending_period, carried, excess, wave_time
-from petfsi.notes.forms import SLENDER, Form
+from petfsi.notes.forms import Bend
 from petfsi.notes.note import Note, Notes, View
 from petfsi.scene.schema import Time
 from petfsi.scene.solids import Solid
@@ -40,41 +40,34 @@ def loose(view: View) -> Notes:
 
 def locking(view: View) -> Notes:
     """Warn of linear elements that are too few across what bends, or too incompressible."""
+    dim = view.scene.dim
     for name, form in view.forms.items():
-        solid = view.scene.solids[name]
-        if solid.shape.beam is not None or solid.elements != "linear" or not _bends(view, name):
+        solid, span = view.scene.solids[name], view.spans[name]
+        bend = form.wall if span is None else form.bend(span.axis)
+        if bend is None or solid.shape.beam is not None or solid.elements != "linear":
             continue
-        span = view.spans[name]
-        axis = -1 if span is None else span.axis
-        part = excess(solid, form, solid.volumetric, axis)
+        part = excess(solid, bend, dim, solid.volumetric)
         if part <= STIFF:
             continue
         times = f"about {1 + part:.2g}" if part < MOST_SAID else f"more than {MOST_SAID:g}"
         yield Note(
-            f"solids.{name}: linear elements, {form.across:.2g} across it, poisson = {solid.poisson:g}: it bends "
-            f"{times} times too stiffly (locking); {_remedy(solid, form, axis)}",
+            f"solids.{name}: linear elements, {bend.across:.2g} across {'it' if form.filled else 'its wall'}, poisson "
+            f"= {solid.poisson:g}: it bends {times} times too stiffly (locking); {_remedy(solid, bend, dim)}",
             warns=True,
         )
 
 
-def _remedy(solid: Solid, form: Form, axis: int) -> str:
-    """Return what makes a solid bend along an axis as it should."""
-    if form.spacing[axis] > LONG * form.spacing[0]:
-        beam = ", or give it as a beam" if len(form.axes) == 2 else ""
+def _remedy(solid: Solid, bend: Bend, dim: int) -> str:
+    """Return what makes a solid bend as it should."""
+    if bend.ratio > LONG:
+        beam = ", or give it as a beam" if dim == 2 else ""
         return f'set elements = "quadratic", with more of them along it{beam}'
     full, reduced = (
-        math.ceil(form.across * math.sqrt(excess(solid, form, kind, axis) / FINE))
+        math.ceil(bend.across * math.sqrt(excess(solid, bend, dim, kind) / FINE))
         for kind in (solid.volumetric, "reduced")
     )
     more = f'volumetric = "reduced" and {reduced}' if reduced < full else f"{full}"
     return f'set elements = "quadratic", or take {more} across it'
-
-
-def _bends(view: View, name: str) -> bool:
-    """Return whether a solid can bend: a hollow one in its walls."""
-    form = view.forms[name]
-    hollow = view.scene.solids[name].shape.cavity is not None
-    return view.spans[name] is not None or (hollow and form.lengths[-1] >= SLENDER * form.thickness)
 
 
 def swings(view: View) -> Notes:
@@ -113,6 +106,8 @@ def _steps(number: float) -> str:
     size = max(number, 1 / number)
     digits = 1 - math.floor(math.log10(size))
     text = f"{round(size, digits):,.{max(digits, 0)}f}" if size < 1e15 else f"{size:.1e}"
+    if text == "1.0":
+        return "1 step"
     return f"{text} steps" if number >= 1 else f"1/{text} step"
 
 

@@ -22,7 +22,8 @@ STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
 LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK", "MV2_COMM_WORLD_SIZE")
 
 
-def _is_launched() -> bool:
+def is_launched() -> bool:
+    """Return whether an MPI launcher has started this process."""
     return any(name in os.environ for name in LAUNCHERS)
 
 
@@ -35,6 +36,16 @@ def open_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, mode, closefd=False))
+
+
+def say(line: str) -> None:
+    """Print a line at once; a reader who has left ends nothing."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    except (OSError, ValueError):
+        # what is left in the buffer would be tried again, and complained of, when Python ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Console:
@@ -66,7 +77,7 @@ class Console:
                 self._log = os.open(
                     log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666
                 )
-        if sys.stdout.isatty() and not _is_launched():
+        if sys.stdout.isatty() and not is_launched():
             self._start_bar(total)
 
     def _start_bar(self, total: int | None) -> None:
@@ -111,7 +122,7 @@ class Console:
             with self._watched() as bar:
                 bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         elif shown:
-            self._print(line)
+            say(line)
         if logged and self._log is not None:
             with suppress(OSError):  # unbuffered: a killed run leaves its last words
                 os.write(self._log, (line + "\n").encode())
@@ -124,14 +135,6 @@ class Console:
             yield self._bar
         except OSError:
             self._bar = None
-
-    def _print(self, line: str) -> None:
-        encoding = sys.stdout.encoding or "utf-8"
-        try:
-            print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
-        except (OSError, ValueError):
-            # what is left in the buffer would be tried again, and complained of, when Python ends
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def close(self) -> None:
         """Take the bar down and close the log."""

@@ -122,7 +122,7 @@ def needs(scene: Scene) -> Iterator[tuple[str, str, float]]:
         places = math.prod(size / fluid.spacing for size in fluid.size)
         yield "fluid.spacing", f" = {fluid.spacing:g}", places * 8.0 * dim
     for name, solid in scene.solids.items():
-        key, value, nodes, cells = _counted(f"solids.{name}.shape", solid, dim)
+        key, value, nodes, cells = solid_counts(f"solids.{name}.shape", solid, dim)
         yield key, value, solid_bytes(dim, nodes, cells)
     for table in ("solids", "obstacles"):
         for name, item in getattr(scene, table).items():
@@ -143,7 +143,7 @@ def _samples(shape: Shape, spacing: float) -> float:
     return 2.0 * float(sum(math.prod(face) for face in itertools.combinations(size.tolist(), len(size) - 1)))
 
 
-def _counted(key: str, solid: Solid, dim: int) -> tuple[str, str, float, float]:
+def solid_counts(key: str, solid: Solid, dim: int) -> tuple[str, str, float, float]:
     """Return the key that says how fine a body is, what stands there, and its nodes and cells; of files none."""
     box, ball, beam = solid.shape.box, solid.shape.ball, solid.shape.beam
     order = 2 if solid.elements == "quadratic" else 1

@@ -301,7 +301,7 @@ def _versions() -> list[str]:
 
 
 def _prefixes() -> list[str]:
-    from petfsi.solving.solver import PREFIX, field_prefix
+    from petfsi.solving.option_rules import PREFIX, field_prefix
 
     rows = [
         (PREFIX, "the coupled system of a step: solid velocities and fluid pressures"),

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 from mpi4py import MPI
 
 from petfsi.ranks import on_root
 from petfsi.runs.memory import refuse_too_large
-from petfsi.runs.origin import Origin
 from petfsi.runs.plan import default_options
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving import solver as solve
+from petfsi.solving.option_database import load_options
 from petfsi.solving.options import Options
+
+if TYPE_CHECKING:
+    from petfsi.runs.origin import Origin
 
 
 def made_ready(
-    comm: MPI.Comm, scene: Scene, petsc_args: list[str], origin: Origin | None = None
+    comm: MPI.Comm,
+    scene: Scene,
+    petsc_args: list[str],
+    origin: Origin | None = None,
+    begins: Callable[[MPI.Comm, Scene], object] = lambda comm, scene: None,
 ) -> tuple[Simulation, list[str], Options]:
     """Return the simulation of a scene, ready for its first step, options that nothing reads, and all. Collective.
 
     Writes nothing: everything that can be wrong with the scene and the options is found here, its probes included.
+    ``begins`` is called once that seems to be possible at all.
 
     Raises
     ------
@@ -32,7 +42,8 @@ def made_ready(
     ranks = comm.size, comm.allreduce(here.size, MPI.MAX)
     here.Free()
     on_root(comm, lambda: refuse_too_large(scene, ranks=ranks))
-    options = solve.load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
+    begins(comm, scene)
+    options = load_options(petsc_args, base=on_root(comm, lambda: default_options(scene)))
     simulation = Simulation(comm, scene)
     unread = simulation.prepare() if origin is None else origin.begin(simulation)
     simulation.probe()

@@ -19,7 +19,8 @@ from petfsi.output.mesh_files import mesh_files, own_names
 from petfsi.output.rundir import RunDirectory
 from petfsi.output.summary import read_summary
 from petfsi.ranks import on_root
-from petfsi.runs.console import Console
+from petfsi.runs.ahead import ahead
+from petfsi.runs.console import Console, say
 from petfsi.runs.legs import describe_changes, find_changes, judge_changes
 from petfsi.runs.origin import Origin
 from petfsi.runs.plan import MAX_COUNTED, read_files, told_of
@@ -31,7 +32,7 @@ from petfsi.scene.changes import RESUMABLE
 from petfsi.scene.load import dump_scene, load_scene
 from petfsi.scene.schema import Scene
 from petfsi.simulation import Simulation
-from petfsi.solving import solver as solve
+from petfsi.solving.option_database import load_options
 from petfsi.solving.options import Options
 
 #: Lines about what is wrong with a run directory.
@@ -61,7 +62,7 @@ def run_scene(
     origin = Origin.find(source, out, comm) if source is not None else None
     meshes = on_root(comm, lambda: mesh_files(scene))
     with read_once():
-        simulation, unread, options = made_ready(comm, scene, petsc_args, origin)
+        simulation, unread, options = made_ready(comm, scene, petsc_args, origin, _say_ahead)
         begins = on_root(comm, lambda: _begins(simulation))
     text = dump_scene(scene, own_names([mesh.mark for mesh in meshes], out))
     with held(out, comm, make=True) as lock:
@@ -103,7 +104,8 @@ def resume_run(
             lines = "".join(f"\n  {line}" for line in misfits[:MAX_TOLD])
             raise InputError(f"{directory} does not fit its checkpoint {found.path.name}; nothing was changed:{lines}")
         scene = on_root(comm, lambda: load_scene(files.scene, sets, only=RESUMABLE))
-        options = solve.load_options(petsc_args, stored=files.options)
+        options = load_options(petsc_args, stored=files.options)
+        _say_ahead(comm, scene)
         with read_once():
             simulation = Simulation(comm, scene)
             # of the scene's start: it would move the fluid's faces to the restored solid
@@ -136,6 +138,13 @@ def resume_run(
                 console.note(line)
             with run.recorded():
                 return run.loop(steps, stop)
+
+
+def _say_ahead(comm: MPI.Comm, scene: Scene) -> None:
+    """Say what is made ready now, where that takes long. Collective."""
+    line = on_root(comm, lambda: ahead(scene, comm.size))
+    if line and comm.rank == 0:
+        say(line)
 
 
 def _restore(simulation: Simulation, found: checkpoints.CheckpointInfo) -> None:
@@ -186,6 +195,8 @@ def _greet(
     files: RunDirectory,
     begins: tuple[list[str], list[str]] = ([], []),
 ) -> None:
+    if begun := ahead(simulation.scene, simulation.comm.size):
+        console.log(begun)  # it was said before there was a log
     for line in beginning(simulation, options, files):
         console.note(line)
     told = [part.notes for part in (simulation.fluid, simulation.watch, simulation.guard) if part is not None]

@@ -10,7 +10,7 @@ from typing_extensions import Doc
 
 from petfsi.registry import COUPLINGS, FLUIDS
 from petfsi.scene.sides import ParticleSides, Sides
-from petfsi.scene.tables import Cells, Flag, Number, OneOf, Real, Shape, Table, Vector
+from petfsi.scene.tables import Cells, Density, Flag, Metres, Number, OneOf, Real, Shape, Table
 
 #: The kind of a fluid that does not say which it is.
 DEFAULT = "mac"
@@ -47,17 +47,12 @@ class FluidTable(Table):
         BeforeValidator(OneOf(FLUIDS)),
         Doc("How the fluid is computed. mac: on a staggered grid, incompressible; sph: with particles."),
     ] = DEFAULT
-    density: Annotated[
-        Real, Field(gt=0, description="kg/m^3"), Doc("Mass per volume; of particles where their pressure is 0.")
-    ]
+    density: Annotated[Density, Doc("Mass per volume; of particles where their pressure is 0.")]
     origin: Annotated[
-        Vector,
-        Field(description="m"),
+        Metres,
         Doc("The corner with the smallest coordinates: of the grid, or of the particles' box."),
     ]
-    size: Annotated[
-        Vector, Field(description="m"), Doc("The lengths of the grid, or of the particles' box, each greater than 0.")
-    ]
+    size: Annotated[Metres, Doc("The lengths of the grid, or of the particles' box, each greater than 0.")]
     initial: Annotated[FluidInitial, Doc("The fluid at time zero.")] = FluidInitial()
 
     @property

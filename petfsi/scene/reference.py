@@ -130,7 +130,7 @@ def _why_not(words: Sequence[str]) -> str:
             return unknown([*table[0].inside, words[n]])
         if table:
             return f"{'.'.join(table[0].path)} is no table"
-    return unknown([words[0]])
+    return unknown([words[0] or ".".join(words)])
 
 
 # ---- how they are told --------------------------------------------------------------------------------------

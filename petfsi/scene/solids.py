@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from typing_extensions import Doc
 
 from petfsi.registry import MATERIALS
-from petfsi.scene.tables import Flag, GroupName, Number, OneOf, Real, Shape, Table, Vector
+from petfsi.scene.tables import Density, Flag, GroupName, Number, OneOf, Real, Shape, Table, Vector
 
 Component = Literal["x", "y", "z", "angle"]
 Place = Literal["left", "right", "bottom", "top", "back", "front", "all", "start", "end"]
@@ -153,7 +153,7 @@ class Solid(Table):
     """A deformable body of triangles or tetrahedra, or a beam."""
 
     shape: Annotated[Shape, Doc("What the body is at rest: a box or a ball with cells, a beam, or a mesh file.")]
-    density: Annotated[Real, Field(gt=0, description="kg/m^3"), Doc("Mass per volume at rest.")]
+    density: Annotated[Density, Doc("Mass per volume at rest.")]
     young: Annotated[
         Real,
         Field(gt=0, description="Pa"),

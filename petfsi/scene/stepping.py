@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from decimal import Decimal
 
 from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.schema import Time
@@ -114,8 +115,9 @@ class Stepping:
     def after(self, step: int, t: float, dt: float) -> float:
         """Return the time after a step of length dt that began at t and ends as number ``step``, s."""
         begin, start = self._origin
-        if self.constant and dt == self._length:  # a multiple has one rounding, a sum as many as terms
-            return start + (step - begin) * dt
+        if self.constant and dt == self._length:
+            end = multiple(start, step - begin, dt)
+            return self.end if abs(end - self.end) <= SLACK * dt else end
         end = self._sum(t, dt)
         if self.constant:  # the steps of a run that is given a later end are counted from here
             self._origin = step, end
@@ -146,3 +148,8 @@ class Stepping:
         except ExpressionError:
             return None
         return step
+
+
+def multiple(start: float, number: int, dt: float) -> float:
+    """Return start + number dt as it is on paper: 3 times 0.1 s are 0.3 s, which no sum of binary numbers is."""
+    return float(Decimal(repr(float(start))) + number * Decimal(repr(float(dt))))

@@ -55,6 +55,10 @@ Real = Annotated[float, Strict()]
 Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 Vector = list[Real]
+#: A point, or lengths along the axes.
+Metres = Annotated[Vector, Field(description="m")]
+Length = Annotated[Real, Field(gt=0, description="m")]
+Density = Annotated[Real, Field(gt=0, description="kg/m^3")]
 Cells = list[Annotated[Whole, Field(ge=1)]]
 #: The name of a group in a mesh file, or its number.
 GroupName = Annotated[str, Field(min_length=1), BeforeValidator(_name_of_number)]
@@ -74,8 +78,8 @@ class Table(BaseModel):
 class Box(Table):
     """An axis-parallel box; with ``cells`` it can be meshed."""
 
-    origin: Annotated[Vector, Field(description="m"), Doc("The corner with the smallest coordinates.")]
-    size: Annotated[Vector, Field(description="m"), Doc("The lengths of the edges, each greater than 0.")]
+    origin: Annotated[Metres, Doc("The corner with the smallest coordinates.")]
+    size: Annotated[Metres, Doc("The lengths of the edges, each greater than 0.")]
     cells: Annotated[
         Cells | None,
         Doc(
@@ -88,8 +92,8 @@ class Box(Table):
 class Ball(Table):
     """A disk (2D) or ball (3D); with ``cells``, how many it has across, it can be meshed."""
 
-    centre: Annotated[Vector, Field(description="m"), Doc("The middle.")]
-    radius: Annotated[Real, Field(gt=0, description="m"), Doc("The distance from the middle to the surface.")]
+    centre: Annotated[Metres, Doc("The middle.")]
+    radius: Annotated[Length, Doc("The distance from the middle to the surface.")]
     cells: Annotated[
         Annotated[Whole, Field(ge=2, multiple_of=2)] | None,
         Field(description="cells across"),
@@ -100,26 +104,25 @@ class Ball(Table):
 class Cylinder(Table):
     """A finite round cylinder between two points (3D only)."""
 
-    start: Annotated[Vector, Field(description="m"), Doc("The middle of one end.")]
-    end: Annotated[Vector, Field(description="m"), Doc("The middle of the other end.")]
-    radius: Annotated[Real, Field(gt=0, description="m"), Doc("The distance from the axis to the round surface.")]
+    start: Annotated[Metres, Doc("The middle of one end.")]
+    end: Annotated[Metres, Doc("The middle of the other end.")]
+    radius: Annotated[Length, Doc("The distance from the axis to the round surface.")]
 
 
 class Halfspace(Table):
     """All points behind a plane: (x - point) . normal <= 0."""
 
-    point: Annotated[Vector, Field(description="m"), Doc("A point of the plane.")]
+    point: Annotated[Metres, Doc("A point of the plane.")]
     normal: Annotated[Vector, Doc("The direction across the plane out of the half space, of any length.")]
 
 
 class Beam(Table):
     """A straight beam between two points (2D only), its faces half a thickness on either side."""
 
-    start: Annotated[Vector, Field(description="m"), Doc('Where the axis begins: "start" of supports.')]
-    end: Annotated[Vector, Field(description="m"), Doc('Where the axis ends: "end" of supports.')]
+    start: Annotated[Metres, Doc('Where the axis begins: "start" of supports.')]
+    end: Annotated[Metres, Doc('Where the axis ends: "end" of supports.')]
     thickness: Annotated[
-        Real,
-        Field(gt=0, description="m"),
+        Length,
         Doc(
             "The distance h between the two faces, less than the length. Per metre of width EA = E h and EI = E h^3/12 "
             "with the solid's young E, as of a plate that may contract across its width: plane stress. For plane "

@@ -6,15 +6,15 @@ import numpy as np
 from petsc4py import PETSc
 
 from petfsi.solving import option_database
+from petfsi.solving.convergence import Outcome
 from petfsi.solving.newton import Restage, as_it_is
-from petfsi.solving.solver import Outcome
 from petfsi.solving.system import System
 
 
 class DiagonalSolver:
     """Divides by the diagonal of the system's operator, if it has one.
 
-    It has the face of ``solve.Solver`` and reads no option.
+    It has the face of ``Solver`` and reads no option.
     """
 
     decoupled = splits = iterates = False

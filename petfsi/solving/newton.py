@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -11,6 +10,7 @@ from petsc4py import PETSc
 
 from petfsi import petsc
 from petfsi.errors import InputError, SolveError, is_memory
+from petfsi.solving.linear import LinearSolver
 from petfsi.solving.system import System, blown_up
 
 #: Linearise once, or iterate.
@@ -19,19 +19,6 @@ KINDS = ("ksponly", "newtonls")
 #: What a linear solve leaves over, as of a tangent near singular, the next iteration sees: it may be so many times what
 #: the solver was asked for.
 SLACK = 1e4
-
-
-class LinearSolver(Protocol):
-    """What solves the linear systems."""
-
-    def set_up(self) -> None:
-        """Follow the operator's new values. Collective."""
-        ...
-
-    def solve_linear(self, b: PETSc.Vec, x: PETSc.Vec, slack: float) -> tuple[int, dict[str, float]]:
-        """Solve for x, from zero, to a multiple of the tolerance; return iterations and residuals. Collective."""
-        ...
-
 
 #: Makes the system that of these values of the fields (SI); returns whether the operator has changed. Collective.
 Restage = Callable[[list[np.ndarray]], bool]
@@ -208,7 +195,7 @@ class Newton:
             self.solver.set_up()
             self._changed = False
         y.set(0.0)
-        self._iterations += self.solver.solve_linear(f, y, SLACK)[0]
+        self._iterations += self.solver.solve(f, y, SLACK)[0]
 
     def _story(self, norms: dict[str, float]) -> str:
         system, snes = self.system, self.snes

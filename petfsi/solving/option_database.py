@@ -3,17 +3,48 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from petfsi import petsc
+from petfsi.ranks import on_root
 from petfsi.solving.option_rules import PREFIX
-from petfsi.solving.options import Options
+from petfsi.solving.options import DEFAULT, Options, resolve, resolve_stored
 
 _in_force = Options()
+
+
+def load_options(args: list[str], base: str = DEFAULT, stored: Path | None = None) -> Options:
+    """Fill PETSc's database with what files, PETSC_OPTIONS and the command line say; return it. Collective.
+
+    Parameters
+    ----------
+    args : list of str
+        PETSc options as given; ``-options_file`` may name a shipped file without its folder.
+    base : str
+        The shipped file used when the command line names none.
+    stored : Path, optional
+        The options of a run that goes on: used in place of the shipped file and of PETSC_OPTIONS.
+
+    Raises
+    ------
+    InputError
+        On all ranks, with every option that is refused.
+    """
+
+    def read() -> Options:
+        if stored is not None:
+            return resolve_stored(args, os.environ, stored, fits)
+        return resolve(args, os.environ, base, fits)
+
+    found = on_root(MPI.COMM_WORLD, read)
+    put(found)
+    return found
 
 
 def put(options: Options) -> None:
@@ -42,6 +73,16 @@ def only(options: Options) -> Iterator[None]:
         yield
     finally:
         put(before)
+
+
+@contextmanager
+def only_options(args: list[str]) -> Iterator[None]:
+    """Have these PETSc options of petfsi's, and no others, in force inside. Collective.
+
+    Solvers read theirs when they are set up, some when they are first applied, so both must happen inside.
+    """
+    with only(on_root(MPI.COMM_WORLD, lambda: resolve(args, {}, fits=fits))):
+        yield
 
 
 def unread() -> list[str]:

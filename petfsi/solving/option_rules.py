@@ -45,6 +45,11 @@ _NO_NUMBER = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _LARGEST_INTEGER = 2**31 - 1
 
 
+def field_prefix(name: str) -> str:
+    """Return the options prefix of a field's own solver."""
+    return f"{PREFIX}fieldsplit_{name}_"
+
+
 @dataclass(frozen=True)
 class Range:
     """The numbers that an option takes, both ends included."""

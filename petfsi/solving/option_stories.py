@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 from petsc4py import PETSc
 
+from petfsi.errors import InputError, is_memory
 from petfsi.solving import option_database
-from petfsi.solving.option_rules import PREFIX, shown
-from petfsi.solving.options import TOLD, Option
+from petfsi.solving.option_rules import PREFIX, field_prefix, shown
+from petfsi.solving.options import COMMAND_LINE, ENVIRONMENT, TOLD, Option
 
 #: Names worth suggesting for a misspelt option, besides those in force.
 COMMON = (
@@ -37,8 +39,38 @@ NEEDS = (
     ("ksp_gmres_", "ksp_type", ("gmres", "fgmres", "lgmres")),
     ("ksp_gcr_", "ksp_type", ("gcr",)),
 )
+#: Fields that the shipped files have options for, whether they are in a scene or not.
+SHIPPED = ("solid", "pressure", "particles")
 #: Of these a solver that does not iterate reads none.
 ITERATIVE = tuple(f"ksp_{name}" for name in "rtol atol divtol max_it norm_type pc_side initial_guess".split())
+
+
+def refuse_unread(prefix: str, fields: Sequence[str]) -> list[str]:
+    """Return what was given for this run and nothing reads, to warn of; refuse what solvers should have read.
+
+    Parameters
+    ----------
+    prefix : str
+        Of the solver of the whole.
+    fields : sequence of str
+        Of the scene, those with a block.
+
+    Raises
+    ------
+    InputError
+        Naming each option, with the nearest one that was read.
+    """
+    unread, now = option_database.unread(), option_database.in_force()
+    absent = tuple(map(field_prefix, {*SHIPPED} - {*fields}))
+    wrong = [name for name in unread if not name.startswith(absent)]
+    if len(fields) == 1:  # options of the others wait for a scene that couples
+        mine, others = (prefix, f"{PREFIX}snes_"), f"{PREFIX}fieldsplit_" if prefix == PREFIX else "-"
+        wrong = [name for name in wrong if name.startswith(mine) and not name.startswith(others)]
+    if wrong:
+        raise InputError(unread_story(wrong, prefix, fields))
+    # of a file for many runs nobody need be told
+    given = [name for name in unread if now.chosen[name].origin in (COMMAND_LINE, ENVIRONMENT)]
+    return given + [option.name for option in now.left_out]
 
 
 def unread_story(names: Sequence[str], prefix: str, fields: Sequence[str]) -> str:
@@ -99,6 +131,17 @@ def petsc_text(error: PETSc.Error) -> str:
         line for line in lines[where + 1 :] if line and not line.startswith(("*", "See http", "Unknown type. Check"))
     ]
     return shown(" ".join(said).rstrip(".,: "), 300) or f"error code {error.ierr}"
+
+
+@contextmanager
+def options_blamed(prefix: str) -> Iterator[None]:
+    """Have what PETSc refuses inside told as a mistake in the options of this solver."""
+    try:
+        yield
+    except PETSc.Error as error:
+        if is_memory(error):
+            raise
+        raise InputError(option_story(prefix, error)) from None
 
 
 def option_story(prefix: str, error: PETSc.Error) -> str:

@@ -7,7 +7,8 @@ import numpy as np
 from petfsi.errors import SolveError
 from petfsi.fields.fluids import PressureFluid
 from petfsi.fields.solids import SolidField
-from petfsi.solving import solver as solve
+from petfsi.solving.linear import LinearSolver
+from petfsi.solving.option_database import only_options
 from petfsi.solving.regions import ClosedRegions
 from petfsi.solving.solver import Solver
 from petfsi.solving.system import System
@@ -120,13 +121,13 @@ def _solve(system: System, solver: Solver, regions: ClosedRegions | None, fluid:
     try:
         if solver.decoupled and regions is not None:
             solver.reset()
-            with solve.only_options([]), regions.coupled():
-                other = Solver(system)
+            with only_options([]), regions.coupled():
+                other = LinearSolver(system)
                 other.set_up()
-                other.solve_linear(system.rhs, system.solution)
+                other.solve(system.rhs, system.solution)
                 other.reset()
         else:
-            solver.solve_linear(system.rhs, system.solution)
+            solver.linear.solve(system.rhs, system.solution)
     except SolveError as error:
         # what is left of a stiff body's large forces may be no more than their round-off
         norms = system.update_residual()

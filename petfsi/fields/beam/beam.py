@@ -112,7 +112,7 @@ class BeamSolid(NodalSolid):
     def _strips(self) -> dict[str, Slab]:
         """Return what never changes of the output: the strips at rest."""
         mesh = SimplexMesh.union([strip_mesh(beam) for beam in self._beams.values()])
-        begin, end, n = self._slab
+        begin, end, n = self._exchange.slab
         first, last = slab(len(mesh.cells), self.comm.rank, self.comm.size)
         return {
             "points": Slab(mesh.points[2 * begin : 2 * end], (2 * begin, 0), (2 * n, self.dim)),
@@ -222,7 +222,7 @@ class BeamSolid(NodalSolid):
 
     def surface_velocity(self) -> np.ndarray:
         """Return w of the step last accepted at the surface's points, shape (n_points, 2). Collective."""
-        return self._at_points(self._integrator.solved(self._motion()))
+        return self._at_points(self._solved())
 
     def _at_points(self, rates: np.ndarray) -> np.ndarray:
         """Return by the present sections how points move if this rank's nodes move so. Collective."""
@@ -281,8 +281,8 @@ class BeamSolid(NodalSolid):
 
     def output(self) -> dict[str, Slab]:
         """Return points, cells and body of the strips, and displacement and velocity of their points. Collective."""
-        begin, end, n = self._slab
-        d, u = self._to_natural(self.displacement), self._to_natural(self.velocity)
+        begin, end, n = self._exchange.slab
+        d, u = self._exchange.to_natural(self.displacement), self._exchange.to_natural(self.velocity)
         rest, thickness = self._rest_angle[begin:end], self._thickness[begin:end]
         moved = face_offsets(rest + d[:, 2], thickness) - face_offsets(rest, thickness) + d[:, None, :2]
         turning = face_slopes(rest + d[:, 2], thickness) * u[:, 2, None, None] + u[:, None, :2]

@@ -2,44 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from petfsi.errors import InputError
 from petfsi.fields.base import Stock, Work
 from petfsi.fields.mac import budget, views
+from petfsi.fields.mac.body_forces import BodyForces
 from petfsi.fields.mac.carrying import advect
-from petfsi.fields.mac.carrying.extrapolate import FAR, Band
+from petfsi.fields.mac.carrying.extension import Extension
 from petfsi.fields.mac.carrying.lineage import Lineage
 from petfsi.fields.mac.carrying.sheets import Sheets
 from petfsi.fields.mac.carrying.transport import Advection, transport
 from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces, each
-from petfsi.fields.mac.grid.marks import beside
-from petfsi.fields.mac.grid.sides import wrapped_points
+from petfsi.fields.mac.grid.initial import set_initial
 from petfsi.fields.mac.projection import pressure
 from petfsi.fields.mac.projection.covered import CoveredGrid
-from petfsi.fields.mac.projection.weight import Weight
+from petfsi.fields.mac.projection.operators import Operators
+from petfsi.fields.mac.projection.regions import box_around
+from petfsi.fields.mac.saved import Saved, parts_slabs, read_parts
 from petfsi.fields.mac.walls.parts import Parts
 from petfsi.fields.replicated import read_whole, whole_slab
-from petfsi.fields.slabs import Reader, Slab, scalar_slab
-from petfsi.fields.stored import outside, refuse, step_fault
-from petfsi.ranks import agreed
+from petfsi.fields.slabs import Reader, Slab
+from petfsi.fields.stored import refuse
 from petfsi.scene import fluids
-from petfsi.scene.expressions import Expression, evaluate_at
 from petfsi.scene.schema import Scene
 from petfsi.scene.side_notes import side_notes
-from petfsi.scene.tables import Number
 
 if TYPE_CHECKING:
     from petfsi.fields.mac.projection.cutgrid import Openings
-
-#: Less than this part of a jet's area is lost to round-off.
-ROUND_OFF = 1e-9
 
 
 class MacFluid(CoveredGrid):
@@ -85,14 +78,10 @@ class MacFluid(CoveredGrid):
         self.sheets: Sheets | None = None
         self._extra_pressure = np.zeros(0)
         self._other_pressure: np.ndarray | None = None
-        self._forces: budget.Forces | None = None
         self._weighed = True  # no step has pushed anything yet
-        self._bands = [Band(grid, axis) for axis in self._axes]
-        self._smoke_band = None if self.smoke is None else Band(grid, None)
-        gravity: list[Number] = scene.gravity or [0.0] * grid.dim
-        self._gravity = [Expression(g, ("t",), f"gravity.{n}") for n, g in enumerate(gravity)]
-        exact = scene.cuts_cells and scene.gravity is not None
-        self.weight = Weight(grid, self.density, self._gravity) if exact else None
+        self._extension = Extension(grid, self.surroundings, self.smoke is not None)
+        self._body_forces = BodyForces(grid, scene, self.density)
+        self.weight = self._body_forces.weight
         self._uncover()
         self._start()
         self._notes = side_notes(scene) + self._look_at_jets()
@@ -106,18 +95,7 @@ class MacFluid(CoveredGrid):
             jet.open_fully()
         opened = {key: float(flow.sum()) for key, flow in self.inflows().items()}
         around.evaluate(0.0)
-        whole = [sum(jet.area(self.grid) for jet in around.jets if jet.key == key) for key in opened]
-        areas = self.comm.allreduce(np.array([list(opened.values()), whole]))
-        assert isinstance(self.scene.fluid, fluids.MacFluid)
-        sides, notes, unit = self.scene.fluid.sides, [], "m^2" if self.dim == 3 else "m"
-        for key, (left, area) in zip(opened, areas.T, strict=True):
-            side = getattr(sides, key.split(".")[2])
-            if left <= ROUND_OFF * area and side.inflow.region is not None:
-                raise InputError(f"{key}: obstacles cover all of it, and nothing comes in; move them, or its region")
-            if left < (1.0 - ROUND_OFF) * area:
-                so_much = f"{left:.4g} of its {area:.4g} {unit}"
-                notes.append(f"{key}: obstacles leave {so_much} open; what comes in is as much less")
-        return notes
+        return around.notes_on_covered(opened)
 
     def _start(self) -> None:
         """Set velocity and smoke as the scene says for time zero. Collective."""
@@ -127,29 +105,21 @@ class MacFluid(CoveredGrid):
         self.surroundings.prescribe(self.face_kind, self.boundary_velocity)
         if fluid.initial.velocity is not None:
             for axis, text in enumerate(fluid.initial.velocity):
-                self._evaluate(text, "fluid.initial.velocity", self.velocity[axis], axis)
+                set_initial(self.grid, text, "fluid.initial.velocity", self.velocity[axis], axis)
         for axis in self._axes:
             kind = self.face_kind[axis]
             self.velocity[axis][kind == kinds.DEAD] = 0.0
             wall = kind == kinds.WALL
             self.velocity[axis][wall] = self.boundary_velocity[axis][wall]
         if fluid.smoke is not None and self.smoke is not None:
-            self._evaluate(fluid.smoke.initial, "fluid.smoke.initial", self.smoke, None)
+            set_initial(self.grid, fluid.smoke.initial, "fluid.smoke.initial", self.smoke, None)
             self.smoke[self.cell_kind != kinds.FLUID] = 0.0
-            self._complete_cells(self.smoke)
+            self._extension.cells(self.smoke)
         self._transport.carried = self._extend(self.velocity)
         self.velocity_star = each(np.copy, self.velocity)
         if self.sheets is not None:
             whole = self._sheets_of(Parts.none())
             self._go_on(Lineage(self.grid, whole, self.sheets, self.face_kind))
-
-    def _evaluate(self, text: Number, key: str, array: np.ndarray, axis: int | None) -> None:
-        """Fill the owned part of a local array with the values of an expression at time zero. Collective."""
-        part = self.grid.owned(axis)
-        index = tuple(i.ravel() for i in np.mgrid[part])
-        expression, points = Expression(text, key=key), wrapped_points(self.grid, axis, index)
-        values = agreed(self.comm, lambda: evaluate_at(expression, points, 0.0))
-        array[part] = values.reshape(array[part].shape)
 
     # ---- the step ---------------------------------------------------------------------------------------------
 
@@ -166,19 +136,12 @@ class MacFluid(CoveredGrid):
     def _kinds_changed(self) -> None:
         """Refresh the smoke's band and prescribed velocities, too. Collective."""
         super()._kinds_changed()
-        if self._smoke_band is not None:
-            self._smoke_band.rebuild(self.cell_kind == kinds.FLUID)
+        self._extension.rebuild_cells(self.cell_kind)
         self.surroundings.prescribe(self.face_kind, self.boundary_velocity)
 
     def _reach_changed(self) -> None:
         """Refresh the velocity's bands. Collective."""
-        for axis in self._axes:
-            known = self.face_kind[axis] != kinds.DEAD
-            self._bands[axis].rebuild(known if self.narrow is None else known & ~self.narrow[axis])
-        self._moved = [
-            (band.layer != FAR) & (kind != kinds.WALL) & (kind != kinds.SOLID_FACE)
-            for band, kind in zip(self._bands, self.face_kind, strict=True)
-        ]
+        self._extension.rebuild_faces(self.face_kind, self.narrow)
 
     def _divide(self, parts: Parts, old_kind: list[np.ndarray], other: np.ndarray) -> None:
         """Let divided faces and cells go on with what those had that they come from. Collective."""
@@ -189,20 +152,11 @@ class MacFluid(CoveredGrid):
         self._transport.advection.sheets = self.sheets
         if old is None:
             return
-        self._mark_uncovered(old, self.sheets, old_kind, other)
+        self.sheets.mark_uncovered(old, old_kind, other)
         if len(parts) or len(old.table):
             self._go_on(Lineage(grid, old, self.sheets, old_kind))
         if old.anywhere or self.sheets.anywhere:
             self._renew(self.sheets)
-
-    def _mark_uncovered(self, old: Sheets, new: Sheets, old_kind: list[np.ndarray], other: np.ndarray) -> None:
-        """Tell the new sheets what thin walls have just uncovered: nothing may be read from there."""
-        if not new.anywhere:
-            return
-        new.flipped = new.close & other & (self.cell_kind == kinds.FLUID) & ~new.divided & ~old.divided
-        for a, (before, now) in enumerate(zip(old_kind, self.face_kind, strict=True)):
-            fresh = (before == kinds.DEAD) | beside(new.flipped, a)
-            new.fresh[a][...] = beside(new.close, a) & fresh & ((now == kinds.PRESSURE) | (now == kinds.OPEN))
 
     def _renew(self, sheets: Sheets) -> None:
         """Give what thin walls have just uncovered the values of its own side. Collective."""
@@ -217,7 +171,7 @@ class MacFluid(CoveredGrid):
             self._transport.change(renewed)
         if cells_are and self.smoke is not None:
             self.smoke = sheets.renew_smoke(self.smoke, self.smoke_parts, sheets.flipped)
-            self._complete_cells(self.smoke)
+            self._extension.cells(self.smoke)
 
     def _sheets_of(self, parts: Parts) -> Sheets:
         assert self.narrow is not None
@@ -265,51 +219,18 @@ class MacFluid(CoveredGrid):
         if self.surroundings.carries_along:
             for faces in transport.read():
                 self.surroundings.fill_along(faces)
-        transport.predict(self._moved, dt, self.velocity_star, self._extend)
-        if self.smoke is not None and self._smoke_band is not None:
+        transport.predict(self._extension.moved, dt, self.velocity_star, self._extend)
+        if self.smoke is not None:
             old, parts = self.smoke, self.smoke_parts
-            self.smoke, self.smoke_parts = transport.carry_smoke(old, parts, self._smoke_band.layer != FAR, dt)
-            self._complete_cells(self.smoke)
+            self.smoke, self.smoke_parts = transport.carry_smoke(old, parts, self._extension.moved_smoke, dt)
+            self._extension.cells(self.smoke)
             smoke = self.smoke if moment == dt else old + moment / dt * (self.smoke - old)
             further = self.smoke_parts if moment == dt else parts + moment / dt * (self.smoke_parts - parts)
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
-        self._add_forces(time + moment, transport.factor(dt), smoke, further)
-
-    def _add_forces(self, time: float, duration: float, smoke: np.ndarray | None, further: np.ndarray) -> None:
-        """Accelerate ``velocity_star`` as at ``time`` for ``duration`` and set it on WALL faces. Collective."""
-        buoyancy = 0.0
-        if smoke is not None and self.scene.fluid is not None and self.scene.fluid.smoke is not None:
-            buoyancy = self.scene.fluid.smoke.buoyancy
-        gravity = np.array([float(g(t=time)) for g in self._gravity])
-        local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
-        link_smoke = None if smoke is None or local is None else local.at_cells(smoke, further)
-        heavy = [self.weight is None or p for p in self.grid.periodic]
-        self._forces = forces = budget.Forces.of(gravity, heavy, buoyancy, smoke, link_smoke)
-        before = None if local is None else local.at_faces(self.velocity_star)
-        self.open_sides.evaluate(time, gravity)
-        self.open_sides.push(self.velocity_star, duration)
-        if self.weight is not None:
-            self.weight.at(time)
-            self.weight.push_open_sides(self.velocity_star, duration)
-        if local is not None and before is not None:
-            pushed = local.gathered(local.at_faces(self.velocity_star) - before, local.link)
-            if forces is not None:
-                pushed = pushed + duration * forces.on_links(local.table.axis, np.arange(len(pushed)))
-            self.velocity_star.parts = self.velocity_star.parts + pushed
-        for axis in self._axes:
-            star, kind = self.velocity_star[axis], self.face_kind[axis]
-            dv = duration * gravity[axis]
-            pressure.add_forces(
-                star,
-                self.boundary_velocity[axis],
-                kind,
-                kinds.STEP[axis],
-                dv if self.weight is None or self.grid.periodic[axis] else 0.0,
-                self.pressure if smoke is None else smoke,
-                -buoyancy * dv,
-                self._part(axis),
-            )
-            self.grid.exchange_faces(axis, star, width=1)
+        self._body_forces.push(
+            self.velocity_star, time + moment, transport.factor(dt), smoke, further, self.face_kind,
+            self.boundary_velocity, self.open_sides, self.sheets,
+        )  # fmt: skip
         self._weighed = not self.open_sides.total
 
     def assemble(self, time: float, dt: float) -> None:
@@ -325,13 +246,13 @@ class MacFluid(CoveredGrid):
             self._weighed, self._assembled_for = True, None
         if self._assembled_for != (self.geometry_version, factor):
             self._assemble_block(factor)
-        self.rhs[:] = -self._outflow(self.velocity_star)
+        self.rhs[:] = -self._operators().outflow(self.velocity_star)
         if self.source is not None:
             self.rhs += self.source
 
     def net_outflow(self) -> np.ndarray:
         """Return by unknown what leaves it at the present velocity but through solids' walls."""
-        return self._outflow(self.velocity)
+        return self._operators().outflow(self.velocity)
 
     def push(self, x: np.ndarray, dt: float) -> None:
         """Change the present velocity as the pressure x would in a first step of dt. Collective."""
@@ -346,7 +267,7 @@ class MacFluid(CoveredGrid):
         """Return by unknown what jets let in, m^3/s (m^2/s in 2D); None if there are none. Not collective."""
         if not self.surroundings.has_jets:
             return None
-        return -self._outflow(each(np.zeros_like, self.velocity_star))
+        return -self._operators().outflow(each(np.zeros_like, self.velocity_star))
 
     def inflows(self) -> dict[str, np.ndarray]:
         """Return by unknown what each side with jets lets in. Not collective."""
@@ -355,7 +276,7 @@ class MacFluid(CoveredGrid):
         for key in self.surroundings.jet_keys:
             self.boundary_velocity = [np.zeros_like(v) for v in given]
             self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity, key)
-            found[key] = -self._outflow(still)
+            found[key] = -self._operators().outflow(still)
         self.boundary_velocity = given
         return found
 
@@ -369,24 +290,11 @@ class MacFluid(CoveredGrid):
         self.surroundings.prescribe_jets(self.face_kind, self.boundary_velocity)
         if dt > 0.0:
             self.open_sides.check(moment)
-            for gravity in self._gravity:
-                gravity(t=moment)
+            self._body_forces.at(moment)
 
     def place(self, member: np.ndarray) -> str:
         """Return the box around the cells of some unknowns. Collective."""
-        cells, shape = member[: self.n_cells] != 0.0, self.grid.shape(None)
-        ends = np.full((2, self.dim), -np.inf)
-        for a in self._axes:
-            centres = np.broadcast_to(self.grid.coordinates(None)[a], shape)
-            x = self.grid.to_vec(centres)[cells]
-            if self.extras is not None:
-                x = np.append(x, centres.reshape(-1)[self.extras.cell][member[self.n_cells :] != 0.0])
-            if len(x):
-                ends[:, a] = self.grid.dx[a] / 2 + np.array([x.max(), -x.min()])
-        high, low = self.comm.allreduce(ends, op=np.maximum)
-        return (
-            ", ".join(f"{axis} {0.0 - b:.4g} to {e:.4g}" for axis, b, e in zip("xyz", low, high, strict=False)) + " m"
-        )
+        return box_around(self.grid, self.extras, member)
 
     def rhs_round_off(self) -> float:
         """Return eps ||A v*||: net outflows are differences of what goes in and out. Collective."""
@@ -418,45 +326,18 @@ class MacFluid(CoveredGrid):
             self._remember_extras()
         self.velocity = self._transport.accept(solved, self.face_kind, dt, self._extend)
         if self.smoke is not None:
-            self._complete_cells(self.smoke)
+            self._extension.cells(self.smoke)
 
     def _projected(self, p: np.ndarray, x: np.ndarray, factor: float) -> Faces:
-        """Return v_w = v* - (factor/rho) G p on owned faces, see ``transport``. Collective.
+        """Return v_w = v* - (factor/rho) G p on owned faces, see ``transport`` and ``Operators``. Collective."""
+        local, c = None if self.sheets is None else self.sheets.local, factor / (self.density * self.grid.dx)
+        return self._operators().projected(self.velocity_star, p, x, c, local)
 
-        Parameters
-        ----------
-        p : ndarray
-            Pressure, Pa, a cell array with its ghosts.
-        x : ndarray
-            The same by unknown, with further pieces' at the end.
-        factor : float
-            s.
-        """
-        grid, star = self.grid, self.velocity_star
-        solved = Faces(np.zeros_like(v) for v in self.velocity)
-        for axis in self._axes:
-            pressure.project(
-                star[axis],
-                p,
-                self.boundary_velocity[axis],
-                self.face_kind[axis],
-                kinds.STEP[axis],
-                factor / (self.density * grid.dx[axis]),
-                self._part(axis),
-                solved[axis],
-            )
-        if self.open_sides.total:
-            self.open_sides.relax(solved, star, self.face_kind)
-        if self.extras is not None:
-            assert self.sheets is not None
-            local, extras, n_cells = self.sheets.local, self.extras, grid.layout.n_local
-            parts = extras.project(
-                star.parts, x[n_cells:], self.layout.start + n_cells, p, self.index,
-                factor / (self.density * grid.dx), self.comm, self.open_sides.link_yields,
-            )  # fmt: skip
-            solved.parts = local.gathered(parts, extras.row[extras.owned])
-            local.mean_into(solved, solved.parts)
-        return solved
+    def _operators(self) -> Operators:
+        return Operators(
+            self.grid, self.layout, self.index, self._active, self.face_kind, self.openness, self.boundary_velocity,
+            self.extras, self.open_sides,
+        )  # fmt: skip
 
     def _remember_extras(self) -> None:
         """Keep the pressure of the second piece of split cells where the next step's cells can find it."""
@@ -470,32 +351,11 @@ class MacFluid(CoveredGrid):
 
         Without any such faces the arrays themselves are returned. Collective.
         """
-        extended, slits = [], []
-        for axis, v in enumerate(faces):
-            self.grid.exchange_faces(axis, v)
-            known = v if self.narrow is None else v.copy()
-            self._bands[axis].fill(known)
-            if self.narrow is not None:
-                slits.append((self.openness[axis] < pressure.SLIT) & (self.face_kind[axis] == kinds.PRESSURE))
-                np.copyto(v, known, where=~self.narrow[axis] | slits[axis])
-                self.grid.fill_sides(v, axis)
-            self.grid.fill_sides(known, axis)
-            extended.append(known)
-        new = Faces(extended, faces.parts)
-        if self.sheets is not None and self.sheets.anywhere:
-            # a band takes both sides; and what is narrow now may be read as it is in the next step
-            new = self.sheets.renew_faces(new, self.sheets.slim)
-            for v, known, slit, slim in zip(faces, new, slits, self.sheets.slim, strict=True):
-                np.copyto(v, known, where=slit & slim)
-        if self.surroundings.carries_along:
-            self.surroundings.fill_along(new)
-        return new
-
-    def _complete_cells(self, smoke: np.ndarray) -> None:
-        assert self._smoke_band is not None
-        self.grid.exchange_cells(smoke)
-        self._smoke_band.fill(smoke)
-        self.surroundings.fill_smoke(smoke)
+        slits: list[np.ndarray] = []
+        if self.narrow is not None:
+            pairs = zip(self.openness, self.face_kind, strict=True)
+            slits = [(openness < pressure.SLIT) & (kind == kinds.PRESSURE) for openness, kind in pairs]
+        return self._extension.faces(faces, self.narrow, slits, self.sheets)
 
     # ---- observation ------------------------------------------------------------------------------------------
 
@@ -523,55 +383,15 @@ class MacFluid(CoveredGrid):
         stock = budget.stock(self.grid, self.density, velocity, self.face_kind, self.openness, self.extras)
         if self.slivers is None:
             return stock
-        flow = self._outflow_of(self.slivers.slot, velocity)
+        flow = self._operators().outflow_of(self.slivers.slot, velocity)
         pushed = self.density * self.slivers.size * flow
         kinetic = 0.5 * float(pushed @ flow)
         return Stock(stock.momentum + pushed @ self.slivers.normal, stock.kinetic + kinetic)
 
-    def _outflow(self, velocity: Faces) -> np.ndarray:
-        """Return the net outflow of each of this rank's unknowns through its faces, m^3/s (m^2/s in 2D)."""
-        inflow, cells = np.zeros(self.layout.n_local), np.zeros(self.grid.owned_shape)
-        areas = np.array([self.grid.face_area(axis) for axis in self._axes])
-        own = self.grid.owned(None)
-        for axis in self._axes:
-            through = np.empty_like(velocity[axis])
-            faces = velocity[axis], self.boundary_velocity[axis], self.face_kind[axis], self.openness[axis], through
-            pressure.known_flows(*(array.reshape(-1) for array in faces))
-            above = tuple(slice(s.start + 1, s.stop + 1) if b == axis else s for b, s in enumerate(own))
-            cells += areas[axis] * (through[own] - through[above])
-        cells[~self._active[own]] = 0.0
-        inflow[: self.n_cells] = cells.ravel(order="F")
-        if self.extras is not None:
-            self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
-        return -inflow
-
-    def _outflow_of(self, unknowns: np.ndarray, velocity: Faces) -> np.ndarray:
-        """Return the same for some unknowns, by their local numbers."""
-        inflow = np.zeros(self.layout.n_local)
-        areas = np.array([self.grid.face_area(axis) for axis in self._axes])
-        cells = unknowns[unknowns < self.n_cells]
-        through = np.zeros(len(cells))
-        for axis in self._axes:
-            pressure.known_inflow_of(
-                cells, velocity[axis], self.boundary_velocity[axis], self.face_kind[axis], self.openness[axis],
-                kinds.STEP[axis], areas[axis], self._part(None), through,
-            )  # fmt: skip
-        inflow[cells] = through
-        if self.extras is not None:
-            self.extras.add_inflow(velocity.parts, self.boundary_velocity, areas, self.layout, inflow)
-        return -inflow[unknowns]
-
     def power(self) -> Work:
         """Return this rank's share of the power of gravity and of what comes through sides, see ``budget``."""
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
-        gravity = 0.0
-        if self._forces is not None:
-            forces = self._forces
-            if forces.smoke is not None:  # links may have changed since they were pushed
-                local = self.sheets.local if self.sheets is not None and len(self.sheets.table) else None
-                now = None if local is None else local.at_cells(forces.smoke, self.smoke_parts)
-                forces = replace(forces, link_smoke=now)
-            gravity = budget.power(self.grid, self.density, velocity, *faces, self.extras, forces)
+        gravity = self._body_forces.power(self.density, velocity, self.smoke_parts, *faces, self.extras, self.sheets)
         into = budget.inflow(
             self.grid, self.density, velocity, *faces, self.pressure, self._active, self.weight, self.surroundings,
             self.open_sides, self.extras, self._extra_pressure,
@@ -618,44 +438,38 @@ class MacFluid(CoveredGrid):
 
     def state(self) -> dict[str, Slab]:
         """Return velocity, kinds, pressure, smoke and the transport's past: all that the next step reads."""
-        stored = [*self._stored(), *self._stored_reach(), *self._stored_past()]
-        arrays = {name: self.grid.slab(array, axis) for name, array, axis in stored}
-        arrays |= {"past_dt": scalar_slab(self.comm, self._transport.past_dt)} if self._transport.past else {}
-        return arrays if self.sheets is None else arrays | self._parts_state(self.sheets.table)
-
-    def _parts_state(self, table: Parts) -> dict[str, Slab]:
-        """Return divided cells and faces, and what is on them."""
+        arrays = self._saved().slabs()
+        if self.sheets is None:
+            return arrays
         rank = self.comm.rank
-        values = {f"parts_{name}": whole_slab(rank, array) for name, array in self._on_parts().items()}
-        return table.state(rank) | values | {"cut_at": whole_slab(rank, self.cut_at.ravel())}
+        on_parts = parts_slabs(rank, self.sheets.table, self.velocity, self.smoke_parts, self._transport)
+        return arrays | on_parts | {"cut_at": whole_slab(rank, self.cut_at.ravel())}
 
-    def _on_parts(self) -> dict[str, np.ndarray]:
-        past = {name: faces.parts for name, faces in self._transport.past.items()}
-        return {"velocity_links": self.velocity.parts, "smoke_pieces": self.smoke_parts, **past}
+    def _saved(self) -> Saved:
+        """Return what a checkpoint holds of the grid's arrays."""
+        if self._moves and self._other_pressure is None:
+            self._other_pressure = self.pressure.copy()
+        return Saved(
+            self.grid, self.pressure, self._other_pressure if self._moves else None, self.cell_kind, self.velocity,
+            self.face_kind, self.smoke, self.narrow, self.facing, self._transport,
+        )  # fmt: skip
 
     def _restore_parts(self, read: Reader) -> None:
         """Take back divided cells and faces, and what is on them; kinds are back already. Collective."""
         table = Parts.restored(self.grid, read)
         self.sheets = self._sheets_of(table)
         self._transport.advection.sheets = self.sheets
-        of_pieces = {"smoke_pieces": 0 if self.smoke is None else len(table.cell)}
-        stored = {name: read_whole(read, f"parts_{name}", of_pieces.get(name, len(table))) for name in self._on_parts()}
+        n_pieces = 0 if self.smoke is None else len(table.cell)
+        self.smoke_parts = read_parts(read, table, self.velocity, n_pieces, self._transport)
         self.cut_at = read_whole(read, "cut_at", self.cut_at.size).reshape(-1, self.dim)
-        self.velocity.parts, self.smoke_parts = stored.pop("velocity_links"), stored.pop("smoke_pieces")
-        self._transport.carried.parts = self.velocity.parts
-        for name, parts in stored.items():
-            self._transport.past[name].parts = parts
 
     def restore(self, read: Reader) -> None:
         """Take the state back from a checkpoint, on any number of ranks. Collective."""
         transport = self._transport
         transport.carried = self.velocity if self.narrow is None else each(np.copy, self.velocity)
-        for name, array, axis in [*self._stored(), *self._stored_reach(), *self._stored_past()]:
-            self.grid.read_slab(read, name, array, axis)
-            self.grid.halo.exchange(array, axis)
-        if transport.past:
-            transport.past_dt = float(read("past_dt", (0,), (1,))[0])
-        refuse(self.comm, self._kind_faults(transport.past_dt if transport.past else 0.0))
+        saved = self._saved()
+        saved.read(read)
+        refuse(self.comm, saved.faults())
         for arrays in (self.velocity, transport.carried, *transport.past.values()):
             for axis in self._axes:
                 self.grid.fill_sides(arrays[axis], axis)
@@ -666,43 +480,4 @@ class MacFluid(CoveredGrid):
             self._restore_parts(read)
             self.forget()
         if self.smoke is not None:
-            self._complete_cells(self.smoke)
-
-    def _kind_faults(self, past_dt: float) -> Iterator[str]:
-        """Yield what cannot be of kinds that a file holds: obstacles and sides are the scene's."""
-        yield step_fault(past_dt)
-        yield outside("cell_kind", self.cell_kind[self.grid.owned(None)], kinds.FLUID, kinds.OUTSIDE)
-        for kind, letter, axis in zip(self.face_kind, "xyz", self._axes, strict=False):
-            yield outside(f"face_kind_{letter}", kind[self.grid.owned(axis)], kinds.DEAD, kinds.SPLIT)
-
-    def _stored_reach(self) -> list[tuple[str, np.ndarray, int | None]]:
-        """Return what the transport reads in place of the velocity, and the faces where the two differ."""
-        if self.narrow is None:
-            return []
-        stored: list[tuple[str, np.ndarray, int | None]] = []
-        for axis, letter in zip(self._axes, "xyz", strict=False):
-            stored.append((f"velocity_carried_{letter}", self._transport.carried[axis], axis))
-            stored.append((f"face_narrow_{letter}", self.narrow[axis], axis))
-            stored.append((f"wall_facing_{letter}", self.facing[axis], None))
-        return stored
-
-    def _stored_past(self) -> list[tuple[str, np.ndarray, int | None]]:
-        past = self._transport.past
-        return [(f"{name}_{'xyz'[axis]}", past[name][axis], axis) for name in past for axis in self._axes]
-
-    def _stored(self) -> list[tuple[str, np.ndarray, int | None]]:
-        """Return the names, local arrays and axes of what a checkpoint holds."""
-        stored: list[tuple[str, np.ndarray, int | None]] = [
-            ("pressure", self.pressure, None),
-            ("cell_kind", self.cell_kind, None),
-        ]
-        for axis, letter in zip(self._axes, "xyz", strict=False):
-            stored.append((f"velocity_{letter}", self.velocity[axis], axis))
-            stored.append((f"face_kind_{letter}", self.face_kind[axis], axis))
-        if self.smoke is not None:
-            stored.append(("smoke", self.smoke, None))
-        if self._cutter is not None and self.scene.solids:
-            if self._other_pressure is None:
-                self._other_pressure = self.pressure.copy()
-            stored.append(("pressure_other", self._other_pressure, None))
-        return stored
+            self._extension.cells(self.smoke)

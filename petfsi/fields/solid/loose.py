@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,8 @@ from petfsi.geometry.meshes import SimplexMesh
 RANK = 1e-9
 #: Components of a motion below this part of it are none.
 NONE = 1e-7
+#: What is left of forces that cancel, as a part of them.
+UNPUSHED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,49 @@ def loose_motions(mesh: SimplexMesh, x: np.ndarray, held: np.ndarray) -> list[Ri
         for nodes in _parts(elements, len(x)):
             found += [RigidMotion(body, *motion) for motion in _loose(nodes, x[nodes], held[nodes])]
     return found
+
+
+def without_equilibrium(
+    motions: Sequence[RigidMotion], force: np.ndarray, follows: bool, stiffens: Callable[[int], bool]
+) -> dict[int, list[tuple[RigidMotion, float]]]:
+    """Return the bodies that forces push along some of these motions, or that have no place where they come to rest.
+
+    Not collective.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    force : ndarray, shape (n, width)
+        On the nodes of the whole mesh, zero where they are held, N.
+    follows : bool
+        Whether forces turn with bodies.
+    stiffens : callable
+        Whether forces that do not may hold a body in its place as it turns.
+
+    Returns
+    -------
+    dict of int to list of (RigidMotion, float)
+        Of each such body all of its motions, and the work that forces do along each.
+    """
+    found: dict[int, list[tuple[RigidMotion, float]]] = {}
+    wrong = []
+    for motion in motions:
+        push, steadies = _pushed(motion, force[motion.nodes], follows, stiffens)
+        found.setdefault(motion.body, []).append((motion, push))
+        if push or not steadies:
+            wrong.append(motion.body)
+    return {body: found[body] for body in wrong}
+
+
+def _pushed(
+    motion: RigidMotion, force: np.ndarray, follows: bool, stiffens: Callable[[int], bool]
+) -> tuple[float, bool]:
+    """Return the work of nodal forces (n, width) along a motion, and whether they hold the body as it turns."""
+    works, curved = force * motion.values, force[:, : motion.centripetal.shape[1]] * motion.centripetal
+    push = float(works.sum())
+    steadies = bool(np.any(curved)) and (follows or stiffens(motion.body))
+    steadies = steadies and (follows or abs(float(curved.sum())) > UNPUSHED * float(np.abs(curved).sum()))
+    return (push if abs(push) > UNPUSHED * float(np.abs(works).sum()) else 0.0), steadies
 
 
 def _parts(elements: np.ndarray, n: int) -> list[np.ndarray]:

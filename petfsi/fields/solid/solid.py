@@ -37,7 +37,7 @@ class SimplexSolid(NodalSolid):
         mesh = on_root(comm, lambda: _union(scene))
         super().__init__(comm, scene, scene.solids, mesh, ("x", "y", "z")[: scene.dim])
         first, last = slab(len(mesh.cells), comm.rank, comm.size)
-        begin, end, n = self._slab
+        begin, end, n = self._exchange.slab
         self._static = {
             "points": Slab(mesh.points[begin:end], (begin, 0), (n, self.dim)),
             "cells": Slab(mesh.cells[first:last], (first, 0), mesh.cells.shape),
@@ -154,7 +154,7 @@ class SimplexSolid(NodalSolid):
 
     def surface_velocity(self) -> np.ndarray:
         """Return w of the step last accepted at the surface's points, shape (n_points, dim). Collective."""
-        return self._gather_surface(self._integrator.solved(self._motion())[self._wet])
+        return self._gather_surface(self._solved()[self._wet])
 
     def _vertices(self, wet: np.ndarray) -> np.ndarray:
         """Return where the surface's points are if this rank's nodes on it are at ``wet``. Collective."""
@@ -220,14 +220,14 @@ class SimplexSolid(NodalSolid):
 
     def _smallest_ratios(self, displacement: np.ndarray) -> np.ndarray:
         """Return the smallest det F of each body on any rank. Collective."""
-        least = self._elements.smallest_ratios(self._with_shared(displacement))
+        least = self._elements.smallest_ratios(self._exchange.with_shared(displacement))
         self.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
         return least
 
     def volumes(self) -> dict[str, float]:
         """Return the volume that each body's surface encloses, m^3 (m^2 in 2D). Collective."""
         mesh = self._mesh
-        x = mesh.points + self._with_shared(self.displacement)
+        x = mesh.points + self._exchange.with_shared(self.displacement)
         for group in mesh.groups:
             if group.gradients is None and group.nodes.shape[1] > self.dim + 1:
                 x = beyond_middles(x, group.nodes, self.dim)

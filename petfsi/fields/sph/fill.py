@@ -11,8 +11,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from petfsi.fields.sph.dummies import CHUNK, NEAR, Domain, divided, fine_cells
+from petfsi.fields.sph.domain import Domain
+from petfsi.fields.sph.dummies import NEAR
 from petfsi.fields.sph.law import Law
+from petfsi.fields.sph.layers import CHUNK, divided, fine_cells
 from petfsi.fields.sph.solids import SAME, Array, Region, Solid, build_solids
 from petfsi.geometry.meshes import read_surface
 from petfsi.scene.schema import Obstacle

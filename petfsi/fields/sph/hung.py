@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from petfsi.fields.sph.dummies import FINE, fine_cells, in_layers
+from petfsi.fields.sph.layers import FINE, fine_cells, in_layers
 from petfsi.fields.sph.rims import Rims, unit_normals
 from petfsi.fields.sph.solids import SAME, nearest, pseudonormals
 from petfsi.fields.sph.thin import sampled

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from petfsi.errors import InputError
-from petfsi.fields.sph.dummies import Domain
+from petfsi.fields.sph.domain import Domain
 from petfsi.fields.sph.law import Law
 from petfsi.fields.sph.solids import SAME, Array
 from petfsi.geometry.shapes import inside

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from petfsi.fields.sph.dummies import Domain
+from petfsi.fields.sph.domain import Domain
 from petfsi.fields.sph.solids import Array
 from petfsi.scene.expressions import Expression, evaluate_at
 from petfsi.scene.fluids import SphFluid

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from petfsi.errors import InputError
-from petfsi.fields.sph.dummies import Domain, Dummies, fine_cells, wall_dummies
+from petfsi.fields.sph.domain import Domain
+from petfsi.fields.sph.dummies import Dummies, wall_dummies
 from petfsi.fields.sph.fill import Fill, hydrostatic, liquid
 from petfsi.fields.sph.inlets import inlets
 from petfsi.fields.sph.law import Law
+from petfsi.fields.sph.layers import fine_cells
 from petfsi.fields.sph.plates import plates
 from petfsi.fields.sph.solids import SAME, Solid, nearest, pseudonormals
 from petfsi.fields.sph.thin import backed

@@ -13,7 +13,8 @@ from petfsi.fields.mac.grid import kinds
 from petfsi.fields.mac.grid.faces import Faces
 from petfsi.fields.mac.grid.grid import MacGrid, three
 from petfsi.fields.mac.grid.marks import beside, spread
-from petfsi.fields.mac.walls.parts import LocalParts, Parts, ranges
+from petfsi.fields.mac.walls.local_parts import LocalParts, ranges
+from petfsi.fields.mac.walls.parts import Parts
 
 #: Cells that an extrapolation looks at on either side.
 AROUND = 3
@@ -315,6 +316,24 @@ class Sheets:
         for b in range(self.grid.dim):
             close = spread(close, b, 1)
         return close
+
+    def mark_uncovered(self, old: Sheets, old_kind: list[np.ndarray], other: np.ndarray) -> None:
+        """Mark what thin walls have just uncovered: nothing may be read from there.
+
+        Parameters
+        ----------
+        old : Sheets
+        old_kind : list of ndarray of uint8
+            Kinds of the faces before.
+        other : ndarray of bool
+            Cell array: which were no fluid before, or that on the other side of a wall.
+        """
+        if not self.anywhere:
+            return
+        self.flipped = self.close & other & self._fluid & ~self.divided & ~old.divided
+        for a, (before, now) in enumerate(zip(old_kind, self._kind, strict=True)):
+            fresh = (before == kinds.DEAD) | beside(self.flipped, a)
+            self.fresh[a][...] = beside(self.close, a) & fresh & ((now == kinds.PRESSURE) | (now == kinds.OPEN))
 
     def uncover(self, axis: int, faces: np.ndarray) -> None:
         """Mark local faces, by flat index, whose values were those of other water: none may be read from there."""

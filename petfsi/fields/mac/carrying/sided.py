@@ -115,12 +115,8 @@ def carry_faces(
     dim = cut.dim
     pick, queue = search_room(reach, dim)
     todo = np.empty(2 * pick.size, np.int64)
-    flow, carried, new, own = (
-        empty_charts(reach, dim),
-        empty_charts(reach, dim),
-        empty_charts(reach, dim),
-        empty_charts(reach, dim),
-    )
+    flow, carried = empty_charts(reach, dim), empty_charts(reach, dim)
+    new, own = empty_charts(reach, dim), empty_charts(reach, dim)
     layer = empty_layers(reach, dim)
     every = (np.ones(new[0].shape, np.bool_), np.ones(new[1].shape, np.bool_), np.ones(new[2].shape, np.bool_))
     some, far = np.zeros(3, np.bool_), np.zeros(new[0].shape, np.bool_)
@@ -145,13 +141,9 @@ def carry_faces(
             for up in range(2):
                 f = (c[0] + up * (a == 0), c[1] + up * (a == 1), c[2] + up * (a == 2))
                 w = (start[0] + up * (a == 0), start[1] + up * (a == 1), start[2] + up * (a == 2))
-                divided = cut.kind[a][f] == SPLIT
-                if not divided:
-                    ends = up == 0 or c[a] == cut.high[a] - 1
-                    if not ends or cut.kind[a][f] == DEAD or not moved[a][f]:
-                        continue
-                elif not _leads(cut, cut.first[a][f], piece, up, from_below):
+                if not _is_target(cut, c, piece, a, up, f, moved[a], from_below):
                     continue
+                divided = cut.kind[a][f] == SPLIT
                 part = ((w[0], w[0] + 1), (w[1], w[1] + 1), (w[2], w[2] + 1))
                 lows, highs = _limits(low, high, base, w, crossed)
                 sweep(
@@ -173,6 +165,17 @@ def carry_faces(
                         out_parts[link], done[link] = new[a][w], True
                     else:
                         out[a][f], kept[a][f] = new[a][w], keep
+
+
+@njit(cache=True)
+def _is_target(cut, c, piece, a, up, f, moved, from_below):
+    """Return whether values are carried to the face f below or above a cell c from a piece of it.
+
+    A whole face takes them from the cell above, the last one from that below.
+    """
+    if cut.kind[a][f] == SPLIT:
+        return _leads(cut, cut.first[a][f], piece, up, from_below)
+    return (up == 0 or c[a] == cut.high[a] - 1) and cut.kind[a][f] != DEAD and moved[f]
 
 
 @njit(cache=True)

@@ -23,6 +23,8 @@ from petfsi.scene.tables import Shape
 
 T = TypeVar("T")
 
+#: Less than this part of a jet's area is lost to round-off.
+ROUND_OFF = 1e-9
 #: The names of the lower and upper side per axis.
 NAMES = (("left", "right"), ("bottom", "top"), ("back", "front"))
 
@@ -247,6 +249,27 @@ class Surroundings:
         self.time = float(np.mean(times))
         for jet in self.jets:
             jet.evaluate(*times)
+
+    def notes_on_covered(self, opened: dict[str, float]) -> list[str]:
+        """Refuse jets that obstacles cover altogether; return notes of those that they cover in part. Collective.
+
+        Parameters
+        ----------
+        opened : dict of str to float
+            By the jets' keys what of their areas this rank's obstacles leave.
+        """
+        grid = self.grid
+        whole = [sum(jet.area(grid) for jet in self.jets if jet.key == key) for key in opened]
+        areas = grid.comm.allreduce(np.array([list(opened.values()), whole]))
+        notes, unit = [], "m^2" if grid.dim == 3 else "m"
+        for key, (left, area) in zip(opened, areas.T, strict=True):
+            side = getattr(self.fluid.sides, key.split(".")[2])
+            if left <= ROUND_OFF * area and side.inflow.region is not None:
+                raise InputError(f"{key}: obstacles cover all of it, and nothing comes in; move them, or its region")
+            if left < (1.0 - ROUND_OFF) * area:
+                so_much = f"{left:.4g} of its {area:.4g} {unit}"
+                notes.append(f"{key}: obstacles leave {so_much} open; what comes in is as much less")
+        return notes
 
     def prescribe(self, face_kind: list[np.ndarray], boundary_velocity: list[np.ndarray]) -> None:
         """Write the velocity of every WALL face: that of a jet, else zero."""

@@ -166,3 +166,19 @@ def _extra_pairs(
     exits = np.maximum(*ends)[(extras.below < 0) | (extras.above < 0)] - offset
     is_open[exits[(exits >= 0) & (exits < len(is_open))]] = True
     return np.stack(ends, axis=1)[inner]
+
+
+def box_around(grid: MacGrid, extras: Extras | None, member: np.ndarray) -> str:
+    """Return in words the box around the cells of unknowns, of which ``member`` is not zero. Collective."""
+    n_cells = grid.layout.n_local
+    cells, shape = member[:n_cells] != 0.0, grid.shape(None)
+    ends = np.full((2, grid.dim), -np.inf)
+    for a in range(grid.dim):
+        centres = np.broadcast_to(grid.coordinates(None)[a], shape)
+        x = grid.to_vec(centres)[cells]
+        if extras is not None:
+            x = np.append(x, centres.reshape(-1)[extras.cell][member[n_cells:] != 0.0])
+        if len(x):
+            ends[:, a] = grid.dx[a] / 2 + np.array([x.max(), -x.min()])
+    high, low = grid.comm.allreduce(ends, op=np.maximum)
+    return ", ".join(f"{axis} {0.0 - b:.4g} to {e:.4g}" for axis, b, e in zip("xyz", low, high, strict=False)) + " m"
