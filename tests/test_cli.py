@@ -307,8 +307,6 @@ def test_a_check_imports_nothing_of_outputs_and_leaves_its_imports_alone():
 def test_a_process_alone_looks_for_no_network_unless_it_is_told_to(given, seen, monkeypatch):
     for name in ("OMPI_MCA_pml", *LAUNCHERS):
         monkeypatch.delenv(name, raising=False)
-    for name, value in given.items():
-        monkeypatch.setenv(name, value)
     code = """
 import os, sys
 class Seen:
@@ -324,7 +322,7 @@ except ImportError:
     print(os.environ.get("OMPI_MCA_pml"))
 """
     before = given.get("OMPI_MCA_pml", "None")
-    assert petfsi(code=code).stdout.split() == [seen, before]
+    assert petfsi(code=code, **given).stdout.split() == [seen, before]
 
 
 def test_help_tells_no_range_that_has_no_ends(here):

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -22,9 +21,6 @@ from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.scene.solids import Solid
 from petfsi.scene.tables import Box, Shape
-
-if TYPE_CHECKING:
-    pass
 
 #: A cell is degenerate below this fraction of its longest edge to the power dim.
 FLAT = 1e-12

@@ -12,7 +12,6 @@ from petfsi.errors import InputError
 from petfsi.geometry.groups import cell_groups, point_groups
 from petfsi.geometry.mesh_cells import body_blocks
 from petfsi.geometry.mesh_files import open_mesh
-from petfsi.geometry.meshes import SimplexMesh
 from petfsi.geometry.quadratic import EDGES, facets_with_middles
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.splitting import KINDS, simplices
@@ -22,6 +21,8 @@ from petfsi.scene.tables import Shape
 
 if TYPE_CHECKING:
     import meshio
+
+    from petfsi.geometry.meshes import SimplexMesh
 
 #: Nodes this far from a side of the bounding box, as a fraction of its size, lie on it (files may hold single
 #: precision).

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from petfsi.geometry.seams import GOLDEN
 from petfsi.geometry.shapes import bounds, inside
 from petfsi.notes.bending import carried
 from petfsi.notes.forms import Form
@@ -125,7 +124,7 @@ def _speeds(view: View, dt: float) -> Iterator[tuple[str, np.ndarray]]:
     assert fluid is not None
     low, high = np.array(fluid.origin), np.array(fluid.origin) + fluid.size
     # not equally far apart: what is periodic may vanish at all of them
-    t = scene.time.end * np.modf(GOLDEN * np.arange(INSTANTS))[0]
+    t = scene.time.end * np.modf(np.arange(INSTANTS) * 0.5 * (5**0.5 - 1))[0]
     if fluid.initial.velocity is not None:
         yield "fluid.initial.velocity", _largest(fluid.initial.velocity, _places(low, high), t[:1])
     for axis, pair in enumerate(OPPOSITE[:dim]):
