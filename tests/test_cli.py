@@ -1,4 +1,5 @@
 import io
+import re
 import subprocess
 import sys
 import tomllib
@@ -284,6 +285,25 @@ def test_the_plan_counts_what_is_solved():
     assert plan["steps"].strip() == "10 of 0.1 s to 1 s, bdf2"
     assert plan["outputs"].strip().startswith("5, every 0.3 s")
     assert plan["options"].strip() == f"{DEFAULT_OPTIONS} (the default)"
+
+
+def test_the_plan_says_how_long_steps_of_auto_are():
+    """Of particles 0.9 of the step at the start, of which as many are counted; of others that they are not known."""
+    water = {"kind": "sph", "density": 1000.0, "origin": [0.0, 0.0], "size": [0.6, 0.6], "spacing": 0.02,
+             "sound_speed": 30.0, "fill": [{"box": {"origin": [0.0, 0.0], "size": [0.2, 0.4]}}]}  # fmt: skip
+    table = {"dim": 2, "time": {"end": 0.4, "dt": "auto"}, "fluid": water}
+    plan = dict(line.split(":", 1) for line in describe_plan(scene_from_dict(table)).splitlines() if ":" in line)
+    step = 0.9 * float(plan["sound"].split("sound ")[1].split(" s")[0])
+    number, begin = re.fullmatch(
+        r" *about (\d+) to 0\.4 s: (\S+) s at the start, then nine tenths of the stable step each "
+        r'\(time\.dt = "auto"\), bdf2',
+        plan["steps"],
+    ).groups()
+    assert float(begin) == pytest.approx(step, rel=0.01) and int(number) == pytest.approx(0.4 / step, rel=0.01)
+    table = tomllib.loads(SCENE) | {"time": {"end": 1.0, "dt": "auto", "integrator": "symplectic-euler"}}
+    table = {key: value for key, value in table.items() if key not in ("fluid", "probes", "coupling")}
+    plan = dict(line.split(":", 1) for line in describe_plan(scene_from_dict(table)).splitlines() if ":" in line)
+    assert plan["steps"].strip().startswith("as many as it takes to 1 s: nine tenths of the stable step each (time.dt")
 
 
 def test_the_plan_says_which_options_apply():

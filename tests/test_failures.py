@@ -118,6 +118,10 @@ SCENES = {
     "missing table": (replaced("[time]\nend = 0.5\ndt = 0.05\n", ""), ["time: is missing"]),
     "unknown key": (replaced("young", "yuong"), ["no setting 'yuong'; did you mean 'young' (Pa)?"]),
     "unknown table": (SCENE + "[fluids]\n", ["no setting 'fluids'; did you mean 'fluid'?"]),
+    "a box in a cavity": (
+        replaced(BLOCK, BLOCK[:-1] + ", cavity = { box = { origin = [1.1, 0.2], size = [0.1, 0.1] } } }"),
+        ["solids.block.shape.cavity.box = ", "no setting 'box'; known here are origin, size, cells"],
+    ),
     "text for a number": (replaced("end = 0.5", 'end = "soon"'), ['time.end = "soon": must be a number (s)']),
     "number for a text": (replaced('"A block in a channel"', "3"), ["title = 3: must be a text"]),
     "truth for a number": (replaced("density = 10.0", "density = true"), ["fluid.density = true: must be a number"]),

@@ -17,6 +17,7 @@ from output_cases import SCENE, centres, grid, grid_fields, output, run_on, shar
 
 from petfsi.errors import InputError, SolveError
 from petfsi.output.fields import FieldWriter
+from petfsi.output.film import film_run
 from petfsi.output.frames import Wanted
 from petfsi.output.history import History, column_names, read_history
 from petfsi.output.manifest import Record
@@ -412,3 +413,13 @@ def test_nothing_to_draw_is_an_input_error(tmp_path):
     (tmp_path / "fields" / "000001.h5").write_bytes(b"damaged")
     with pytest.raises(InputError, match="fields cannot be drawn"):
         plot_run(tmp_path)
+
+
+@pytest.mark.parametrize("draw", [plot_run, film_run])
+def test_a_directory_that_is_not_there_is_called_so(tmp_path, draw):
+    with pytest.raises(InputError, match=f"^there is no directory {tmp_path / 'NOSUCH'}$"):
+        draw(tmp_path / "NOSUCH")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is no directory$"):
+        draw(tmp_path / "file")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -285,6 +285,16 @@ def test_groups_of_freefem_and_names_of_su2(tmp_path):
     assert tags["inlet"].nodes.tolist() == [0, 3] and tags["wall"].nodes.tolist() == [0, 1]
 
 
+def test_markers_of_su2_have_their_names_whatever_these_are(tmp_path):
+    """Nothing is said of names, which serve; a marker that is called 1 is not the first; what else is wrong is told."""
+    path, notes = written(tmp_path / "m.su2", SU2.replace("= wall", "= 1")), []
+    assert size(path, 2, notes) == pytest.approx(1.0) and notes == []
+    tags = read_tags(solid(path, "1"), 2, "solids.b", Path())
+    assert tags["inlet"].nodes.tolist() == [0, 3] and tags["1"].nodes.tolist() == [0, 1]
+    size(written(path, SU2.replace("NMARK= 2", "NMARK= 3")), 2, notes)
+    assert len(notes) == 1 and "expected 3 markers" in notes[0] and "string type" not in notes[0]
+
+
 @pytest.mark.parametrize(
     "name, text, why",
     [

@@ -12,6 +12,7 @@ from petfsi.errors import InputError
 from petfsi.scene.changes import RESUMABLE
 from petfsi.scene.checks import RESERVED_PROBES, check_inside_grid, expressions
 from petfsi.scene.load import apply_set, dump_scene, load_scene, parse_value, scene_from_dict
+from petfsi.scene.mistakes import unknown
 from petfsi.scene.schema import Scene
 from petfsi.scene.stepping import Stepping
 
@@ -433,6 +434,36 @@ def test_a_mistake_is_reported_once_with_its_key_its_value_and_what_is_allowed(s
     lines = mistakes(layer(*sets))
     assert len(lines) == 1, lines
     assert key in lines[0] and allowed in lines[0], lines[0]
+
+
+@pytest.mark.parametrize(
+    "key, meant",
+    [
+        ("solids.a.cavity", ["solids.a.shape.cavity"]),
+        ("obstacles.a.cavity", ["solids.NAME.shape.cavity"]),
+        ("obstacles.a.box", ["obstacles.a.shape.box"]),
+        ("solids.a.shape.cavity.box", []),
+        ("box", []),
+        ("fluid.<mac>.box", []),
+        ("fluid.<sph>.box", ["fluid.fill.N.box"]),
+        ("solids.a.shape.young", ["solids.a.young"]),
+        ("solids.a.shape.yuong", ["solids.a.young"]),
+        ("solids.a.shape.thickness", ["solids.a.shape.beam.thickness"]),
+        ("fluid.sides.right.speed", ["fluid.sides.right.inflow.speed"]),
+        ("fluid.sides.sides", ["fluid.sides"]),
+        ("solids.a.loads.2.tag", ["solids.a.loads.2.where.tag"]),
+        ("solids.a.tag", ["solids.a.supports.N.where.tag", "solids.a.loads.N.where.tag"]),
+        ("time.every", ["output.every", "checkpoint.every"]),
+        ("solids.a.yuong", ["young"]),
+    ],
+)
+def test_a_setting_in_a_wrong_place_is_looked_for_near_it_and_not_just_anywhere(key, meant):
+    """One or two keys where it can stand, with the names that the scene has; of more none."""
+    said = unknown([int(part) if part.isdigit() else part for part in key.split(".")])
+    if meant:
+        assert f"did you mean {' or '.join(map(repr, meant))}" in said
+    else:
+        assert f"no setting '{key.split('.')[-1]}'; known here are" in said
 
 
 @pytest.mark.parametrize("lower", [0.6, 0.61])

@@ -372,6 +372,21 @@ def test_a_box_off_the_lattice_has_its_own_and_all_of_its_volume():
     np.testing.assert_allclose(np.unique(np.round(found.x[:, 1], 9)), 0.15 + np.arange(5) * DX)
 
 
+def test_a_box_that_is_larger_than_the_fluids_is_told():
+    """Also where it lacks no place: of less than half a spacing, and of what a period repeats."""
+    room = domain(10, 10, sides=(("slip", "slip"), ("periodic", "periodic")))
+    found = liquid(room, DX, [block([0.0, 0.0], [0.2, 1.0]), block([0.5, 0.0], [0.53, 1.25])], {}, HERE)
+    assert found.notes == [
+        "fluid.fill: 4 places lie outside the box",
+        "fluid.fill.1 has x from 0.5 to 1.03 m, the fluid's box from 0 to 1 m: what lies in that is filled",
+        "fluid.fill.1 is 1.25 m long along y, which repeats after 1 m: that is filled once",
+    ]
+    assert found.volume.sum() == pytest.approx(0.7)
+    found = liquid(room, DX, [block([-0.001, 0.1 * n], [0.2, 0.1]) for n in range(10)], {}, HERE)
+    assert len(found.notes) == 7 and found.notes[-1] == "fluid.fill: 4 more boxes reach beyond the fluid's"
+    assert liquid(room, DX, [block([0.0, 0.7], [1.0, 1.0])], {}, HERE).notes == []
+
+
 def test_what_is_outside_is_dropped_and_counted():
     room = domain(10, 10)
     found = liquid(room, DX, [block([-0.2, 0.0], [0.5, 0.4])], {}, HERE)

@@ -39,10 +39,13 @@ class Tag(NamedTuple):
     facets : ndarray of int, shape (n, dim), or with middles too; None of a group of nodes
         Corners first.
     nodes : ndarray of int, shape (m,)
+    unread : str
+        Why it could not be read, and so has neither.
     """
 
     facets: np.ndarray | None
     nodes: np.ndarray
+    unread: str = ""
 
 
 Tags = dict[str, Tag]
@@ -84,6 +87,8 @@ def read_tags(solid: Solid, dim: int, key: str, directory: Path) -> Tags:
                 if len(own)]  # fmt: skip
         nodes = np.unique(np.concatenate([part.ravel() for part in kept]))
         found.setdefault(name, Tag(None, nodes[nodes >= 0]))
+    for name, why in (mesh.info or {}).get("unread", {}).items():
+        found.setdefault(name, Tag(None, np.zeros(0, dtype=np.int64), why))
     return found
 
 
@@ -108,14 +113,14 @@ def with_middles(tags: Tags, elements: np.ndarray) -> Tags:
     dim = {3: 2, 6: 2, 4: 3, 10: 3}[elements.shape[1]]
     edges, middles = elements[:, EDGES[dim]], elements[:, dim + 1 :]
     found = {}
-    for name, (facets, nodes) in tags.items():
+    for name, (facets, nodes, unread) in tags.items():
         if facets is not None:
             facets = facets_with_middles(facets, elements)
             found[name] = Tag(facets, np.unique(facets))
-        elif middles.size:
+        elif middles.size and not unread:
             found[name] = Tag(None, np.union1d(nodes, middles[np.isin(edges, nodes).all(axis=2)]))
         else:
-            found[name] = Tag(None, nodes)
+            found[name] = Tag(None, nodes, unread)
     return found
 
 
@@ -204,7 +209,9 @@ def located_facets(
 
 
 def _tagged(where: Tagged, key: str, tags: Tags) -> Tag:
-    if where.tag not in tags:
-        known = shown(", ".join(sorted(tags)), 300) or "none at all"
-        raise InputError(f"{key}.where.tag = {where.tag!r}: the mesh file has no such group; it has {known}")
-    return tags[where.tag]
+    tag = tags.get(where.tag)
+    if tag is not None and not tag.unread:
+        return tag
+    known = shown(", ".join(sorted(name for name, other in tags.items() if not other.unread)), 300) or "none at all"
+    why = f"could not be read from the mesh file: {tag.unread}" if tag else "the mesh file has no such group"
+    raise InputError(f"{key}.where.tag = {where.tag!r}: {why}; it has {known}")

@@ -22,7 +22,7 @@ from PIL.GifImagePlugin import getdata
 from petfsi.errors import InputError, PetfsiError
 from petfsi.output import files
 from petfsi.output.frames import Wanted, read_frame, time_of, wanted_files
-from petfsi.output.pictures import own_pictures, reading, refuse_links, scene_figure
+from petfsi.output.pictures import own_pictures, reading, refuse_links, refuse_no_directory, scene_figure
 from petfsi.output.plane import BODIES, WATER
 from petfsi.output.stage import Stage, look_through
 from petfsi.output.surroundings import GREY, HATCH, LINE
@@ -73,6 +73,7 @@ def film_run(
     write = _writer(file)
     if fps is not None and not 0.0 < fps <= MOST:
         raise InputError(f"--fps {fps:g}: must be greater than 0 and at most {MOST:g} frames per second")
+    refuse_no_directory(directory)
     refuse_links(directory)
     with reading(directory):
         paths = wanted_files(directory, wanted)

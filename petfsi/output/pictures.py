@@ -63,6 +63,7 @@ def plot_run(directory: Path, wanted: Wanted | None = None, kind: str = "png") -
         When there is nothing to draw, or nothing of what is wanted, or a file is damaged.
     """
     directory, wanted = Path(directory), wanted or Wanted()
+    refuse_no_directory(directory)
     refuse_links(directory)
     with reading(directory):
         frames = wanted_files(directory, wanted)
@@ -100,6 +101,12 @@ def reading(directory: Path) -> Iterator[None]:
         yield
     except UNDRAWABLE as error:
         raise InputError(f"{directory / 'fields'} cannot be drawn: {error}") from error
+
+
+def refuse_no_directory(directory: Path) -> None:
+    """Raise InputError where there is nothing to draw because there is no such directory."""
+    if not directory.is_dir():
+        raise InputError(f"{directory} is no directory" if directory.exists() else f"there is no directory {directory}")
 
 
 def refuse_links(directory: Path) -> None:

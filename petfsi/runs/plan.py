@@ -182,11 +182,7 @@ def _quantities(scene: Scene, fluid: FluidPlan, nodes: dict[str, int], cells: di
     )
     time = scene.time
     steps = Stepping(time).count(MAX_COUNTED)
-    number = f"{steps:,}" if steps is not None else "many"
-    if steps is None and fluid.step:
-        number = f"about {_count(time.end, fluid.step):,}"
-    dt = time.dt if isinstance(time.dt, str) else f"{time.dt:g}"
-    rows.append(("steps", f"{number} of {dt} s to {time.end:g} s, {time.integrator}"))
+    rows.append(("steps", f"{_steps(scene, steps, fluid.step)}, {time.integrator}"))
     if scene.output.every is not None:
         times = min(_count(time.end, scene.output.every), steps or MAX_COUNTED) + 1
         size = times * (fluid.output_bytes + 16 * scene.dim * sum(nodes.values()))
@@ -199,6 +195,17 @@ def _quantities(scene: Scene, fluid: FluidPlan, nodes: dict[str, int], cells: di
     if scene.fluid is not None and scene.solids:
         rows.append(("coupling", scene.transfer))
     return rows
+
+
+def _steps(scene: Scene, count: int | None, limit: float | None) -> str:
+    """Return how many steps there are and how long they are; ``limit`` is that of particles, s."""
+    time, first = scene.time, _first_step(scene, limit)
+    if not Stepping(time).auto:
+        number = f"{count:,}" if count is not None else "many"
+        return f"{number} of {time.dt if isinstance(time.dt, str) else f'{time.dt:g}'} s to {time.end:g} s"
+    number = "as many as it takes" if first is None else f"about {_count(time.end, first):,}"
+    begin = "" if first is None else f"{min(first, time.end):.3g} s at the start, then "
+    return f'{number} to {time.end:g} s: {begin}nine tenths of the stable step each (time.dt = "auto")'
 
 
 def _count(end: float, every: float) -> int:

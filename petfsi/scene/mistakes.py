@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from petfsi.messages import shown
-from petfsi.scene.keys import every_key, is_form, is_model, kind_of, settings, walk
+from petfsi.scene.keys import NAME, NUMBER, Key, every_key, is_form, is_model, kind_of, settings, walk
 from petfsi.scene.schema import Scene
 
 #: No value stands at the key.
@@ -29,6 +29,10 @@ BOUNDS = {
 }
 #: How much alike names of different tables must be, from 0 to 1, for one to be taken for the other.
 ALIKE = 0.75
+#: More places than this that a setting may be meant for are none.
+MEANT = 2
+#: What only a solid's shape can be or have.
+OF_SOLIDS = ("beam", "cavity")
 
 
 @dataclass(frozen=True)
@@ -132,8 +136,9 @@ def unknown(loc: list[Any]) -> str:
     having = [kind_of(kind) for kind in kinds if name in settings(kind)]
     if having:
         return f"belongs to kind = {' and '.join(having)}; known here are {', '.join(fields)}"
+    inside = [names for names in _elsewhere(loc, name) if names[: len(path) - 1] == _words(path[:-1])]
     near = difflib.get_close_matches(name, fields, 1)
-    if near:
+    if near and not inside:
         unit = fields[near[0]].description
         return f"no setting '{given}'; did you mean '{near[0]}'" + (f" ({unit})?" if unit else "?")
     everywhere = {key.path: key.path[-1] for key in every_key()}
@@ -142,10 +147,58 @@ def unknown(loc: list[Any]) -> str:
     if (name,) in everywhere:
         return f"no setting '{given}' here; it stands at the top of the scene, before any [table]"
     alike = difflib.get_close_matches(name, dict.fromkeys(everywhere.values()), 1, ALIKE)
-    if alike:
-        elsewhere = next(path for path, last in everywhere.items() if last in alike)
-        return f"no setting '{given}' here; did you mean '{'.'.join(elsewhere)}'?"
+    meant = _elsewhere(loc, alike[0]) if alike else []
+    if meant:
+        return f"no setting '{given}' here; did you mean {' or '.join(repr('.'.join(names)) for names in meant)}?"
     return f"no setting '{given}'; known here are {', '.join(fields)}"
+
+
+def _elsewhere(loc: list[Any], name: str) -> list[tuple[str, ...]]:
+    """Return where else a setting may be meant to stand that is called so: at one place or two, or at none.
+
+    Parameters
+    ----------
+    loc : list of str or int
+        Where it stands instead.
+    name : str
+    """
+    at = _words(part for part in loc[:-1] if not is_form(part))
+    kinds = {key.kind for key in every_key()} & {str(part).strip("<>") for part in loc if is_form(part)}
+    keys = [key for key in every_key() if key.path[-1] == name and len(key.path) > 1
+            and not (kinds and key.kind and key.kind not in kinds) and not _only_of_solids(key)]  # fmt: skip
+    paths = {_as_given(key.path, at): key for key in keys}
+    common = {path: _common(path, at) for path in paths}
+    nearest = [path for path in paths if common[path] == max(common.values())]
+    below = any(common[path] == len(at) for path in nearest) and at != ()
+    if not below and len(paths) > MEANT and any(key.tables for key in keys):
+        return []  # a table that may stand in many others is not meant for the one that happens to be near
+    found = [path for path in nearest if len(path) == min(map(len, nearest))]
+    return found if len(found) <= MEANT else []
+
+
+def _words(parts: Iterable[Any]) -> tuple[str, ...]:
+    return tuple(map(str, parts))
+
+
+def _only_of_solids(key: Key) -> bool:
+    """Whether a key is of a shape that solids alone may be, and stands where none can."""
+    return not set(key.path).isdisjoint(OF_SOLIDS) and key.path[:3] != ("solids", NAME, "shape")
+
+
+def _common(path: tuple[str, ...], at: tuple[str, ...]) -> int:
+    """Return how many parts the tables of a key and the one at a path have in common, from the top."""
+    pairs = list(zip(path[:-1], at, strict=False))
+    return next((n for n, (one, other) in enumerate(pairs) if one != other), len(pairs))
+
+
+def _as_given(path: tuple[str, ...], at: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a key's path with the names and numbers that a table's has, as far as both go the same way."""
+    found = list(path)
+    for n, (part, given) in enumerate(zip(path, at, strict=False)):
+        if not (part == given or part == NAME or (part == NUMBER and given.isdigit())):
+            break
+        found[n] = given
+    return tuple(found)
 
 
 def _field(loc: list[Any]) -> FieldInfo | None:

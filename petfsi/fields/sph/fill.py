@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +30,8 @@ FINE = {2: 6, 3: 4}
 LINKED = 1.5
 #: Something nearer than this, in dx, to what is dx above a particle is right above it.
 BLOCKED = 0.75
+#: Of so many boxes it is told that they do not fit into the fluid's.
+TOLD = 6
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class Fill:
         The obstacles.
     clearance : float
         How far particles keep off them, m.
+    cut : list of str
+        What of boxes lies beyond the domain, or longer than a period, box after box.
     """
 
     x: Array
@@ -62,6 +66,7 @@ class Fill:
     domain: Domain
     solids: list[Solid]
     clearance: float
+    cut: list[str]
 
     @property
     def notes(self) -> list[str]:
@@ -71,7 +76,8 @@ class Fill:
             "lie in obstacles or solids, or less than half a spacing before them": self.blocked,
             "lie in more than one shape, and count once": self.double,
         }
-        return [f"fluid.fill: {n} places {what}" for what, n in told.items() if n]
+        more = [f"fluid.fill: {len(self.cut) - TOLD} more boxes reach beyond the fluid's"][: len(self.cut) > TOLD]
+        return [*(f"fluid.fill: {n} places {what}" for what, n in told.items() if n), *self.cut[:TOLD], *more]
 
     def is_solid(self, points: Array) -> Array:
         """Return at which points (n, dim) no particle may be: behind walls, in obstacles or too near to them."""
@@ -130,7 +136,24 @@ def liquid(
         found.append((x, volume, np.full(len(x), number)))
     x, volume, which = (np.concatenate(part) for part in zip(*found, strict=True))
     outside, blocked, double = dropped.tolist()
-    return Fill(x, volume, which, outside, blocked, double, domain, solids, clearance * dx)
+    cut = [line for number, shape in enumerate(shapes) for line in _cut(shape, domain, f"fluid.fill.{number}")]
+    return Fill(x, volume, which, outside, blocked, double, domain, solids, clearance * dx, cut)
+
+
+def _cut(shape: Shape, domain: Domain, key: str) -> Iterator[str]:
+    """Say what is filled of a box that reaches beyond the domain, or is longer than a period, along each axis."""
+    if shape.box is None:
+        return
+    for a, (begin, size) in enumerate(zip(shape.box.origin, shape.box.size, strict=True)):
+        low, high = domain.low[a], domain.high[a]
+        slack, axis = SAME * (high - low), "xyz"[a]
+        if domain.periodic[a]:
+            if size > high - low + slack:
+                repeats = f"which repeats after {high - low:g} m"
+                yield f"{key} is {size:g} m long along {axis}, {repeats}: that is filled once"
+        elif begin < low - slack or begin + size > high + slack:
+            reach = f"{axis} from {begin:g} to {begin + size:g} m"
+            yield f"{key} has {reach}, the fluid's box from {low:g} to {high:g} m: what lies in that is filled"
 
 
 def _filled(

@@ -1,4 +1,4 @@
-"""Nodes, elements and sets of Abaqus's and CalculiX's input files.
+"""Nodes, elements, sets and surfaces of Abaqus's and CalculiX's input files.
 
 meshio knows some types of elements, and takes no blank fields, no sets that are generated and no names in another case.
 """
@@ -13,19 +13,22 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-#: Families of elements, what they are for is none of a mesh's business: their cells by the number of nodes.
+from petfsi.geometry.readers.abaqus_surfaces import Block, Surface, add_surfaces
+
+_FLAT = {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}
+#: Families of elements, what they are for is none of a mesh's business: their cells by the number of nodes, and what
+#: the names of their sides begin with.
 _FAMILIES = (
     (
         re.compile(r"(?:C3D|DC3D|DCC3D|F3D|AC3D|EC3D|Q3D|SC|CSS)(\d+)"),
         {4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15",
          20: "hexahedron20", 27: "hexahedron27"},
+        "S",
     ),
-    (
-        re.compile(r"(?:CPS|CPE|CPEG|DC2D|DCC2D|AC2D|F2D|CAX|CGAX|DCAX|M3D|SFM3D|R3D|US|DS|S|STRI)(\d)"),
-        {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"},
-    ),
-    (re.compile(r"[TR][23]D(\d)"), {2: "line", 3: "line3"}),
-    (re.compile(r"(?:B|PIPE)[23](\d)"), {1: "line", 2: "line3", 3: "line"}),
+    (re.compile(r"(?:CPS|CPE|CPEG|DC2D|DCC2D|AC2D|F2D|CAX|CGAX|DCAX)(\d)"), _FLAT, "S"),
+    (re.compile(r"(?:M3D|SFM3D|R3D|US|DS|S|STRI)(\d)"), _FLAT, "E"),
+    (re.compile(r"[TR][23]D(\d)"), {2: "line", 3: "line3"}, ""),
+    (re.compile(r"(?:B|PIPE)[23](\d)"), {1: "line", 2: "line3", 3: "line"}, ""),
 )  # fmt: skip
 _NODES = {
     "line": 2, "line3": 3, "triangle": 3, "triangle6": 6, "quad": 4, "quad8": 8, "quad9": 9, "tetra": 4, "tetra10": 10,
@@ -63,9 +66,10 @@ class _Sets:
 
 
 def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
-    """Return a mesh with its sets of nodes and elements; what is no cell is told."""
+    """Return a mesh with its sets of nodes and elements and its surfaces; what is no cell is told."""
     points: list[tuple[np.ndarray, np.ndarray]] = []
-    cells: list[tuple[str, np.ndarray, np.ndarray]] = []
+    cells: list[Block] = []
+    surfaces: list[Surface] = []
     node_sets, element_sets = _Sets(), _Sets()
     others: dict[str, int] = {}
     instances = 0
@@ -77,17 +81,19 @@ def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
             if "NSET" in given:
                 node_sets.add(given["NSET"], [points[-1][0]])
         elif word == "ELEMENT":
-            kind = _kind(given.get("TYPE", ""))
+            name = given.get("TYPE", "?").upper()
+            kind, letter = _kind(name)
             if kind is None:
-                name = given.get("TYPE", "?").upper()
                 others[name] = others.get(name, 0) + len(lines)
                 continue
-            rows = _elements(lines, given["TYPE"], _NODES[kind])
-            cells.append((kind, rows[:, 0], rows[:, 1:]))
+            rows = _elements(lines, name, _NODES[kind])
+            cells.append(Block(kind, name, letter, rows[:, 0], rows[:, 1:]))
             if "ELSET" in given:
                 element_sets.add(given["ELSET"], [rows[:, 0]])
         elif word in ("NSET", "ELSET") and word in given:
             (node_sets if word == "NSET" else element_sets).add(given[word], list(_members(lines, "GENERATE" in given)))
+        elif word == "SURFACE":
+            surfaces.append(Surface(given.get("NAME", ""), given, lines))
         elif word in _MAKERS:
             raise meshio.ReadError(f"*{word}: nodes and elements must be written out, in one frame")
         elif word == "INSTANCE":
@@ -97,28 +103,31 @@ def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
     notes += [f"{count:,} lines of elements of type {name} are not read" for name, count in others.items()]
     if not points:
         raise meshio.ReadError("no *NODE")
-    return _joined(points, cells, node_sets.all(), element_sets.all())
+    sets = {"NSET": node_sets.all(), "ELSET": element_sets.all()}
+    mesh, tags = _joined(points, cells, sets["NSET"], sets["ELSET"])
+    add_surfaces(mesh, cells, tags, surfaces, sets, notes)
+    return mesh
 
 
 def _joined(
     points: list[tuple[np.ndarray, np.ndarray]],
-    cells: list[tuple[str, np.ndarray, np.ndarray]],
+    cells: list[Block],
     node_sets: dict[str, np.ndarray],
     element_sets: dict[str, np.ndarray],
-) -> meshio.Mesh:
-    """Return the mesh: nodes by where they stand; of a node that is given twice the last."""
+) -> tuple[meshio.Mesh, np.ndarray]:
+    """Return the mesh and the numbers of its nodes, by which they stand; of a node that is given twice the last."""
     tags, first = np.unique(np.concatenate([numbers for numbers, _ in points])[::-1], return_index=True)
     where = np.concatenate([x for _, x in points])[::-1][first]
     blocks = []
-    for kind, _, nodes in cells:
-        place = np.minimum(np.searchsorted(tags, nodes), len(tags) - 1)
-        if np.any(tags[place] != nodes):
+    for block in cells:
+        place = np.minimum(np.searchsorted(tags, block.nodes), len(tags) - 1)
+        if np.any(tags[place] != block.nodes):
             raise meshio.ReadError("elements name nodes that the file does not hold")
-        blocks.append(meshio.CellBlock(kind, place))
-    sets = {name: [np.flatnonzero(np.isin(numbers, chosen)) for _, numbers, _ in cells]
+        blocks.append(meshio.CellBlock(block.kind, place))
+    sets = {name: [np.flatnonzero(np.isin(block.numbers, chosen)) for block in cells]
             for name, chosen in element_sets.items()}  # fmt: skip
     of = {name: np.flatnonzero(np.isin(tags, chosen)) for name, chosen in node_sets.items()}
-    return meshio.Mesh(where, blocks, cell_sets=sets, point_sets=of)
+    return meshio.Mesh(where, blocks, cell_sets=sets, point_sets=of), tags
 
 
 def _cards(path: Path, depth: int) -> Iterator[Card]:
@@ -141,12 +150,13 @@ def _cards(path: Path, depth: int) -> Iterator[Card]:
         yield from _cards(path.with_name(name), depth + 1)
 
 
-def _kind(name: str) -> str | None:
-    for pattern, kinds in _FAMILIES:
-        found = pattern.match(name.upper())
+def _kind(name: str) -> tuple[str | None, str]:
+    """Return the cell of a type of elements, None of those that are none, and what its sides' names begin with."""
+    for pattern, kinds, letter in _FAMILIES:
+        found = pattern.match(name)
         if found:
-            return kinds.get(int(found[1]))
-    return None
+            return kinds.get(int(found[1])), letter
+    return None, ""
 
 
 def _nodes(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -154,16 +154,21 @@ def _read_nastran(path: Path, notes: list[str]) -> meshio.Mesh:
 
 
 def _read_su2(path: Path, notes: list[str]) -> meshio.Mesh:
-    """Return what meshio reads, with the names of markers instead of numbers."""
+    """Return what meshio reads, with the names of markers instead of numbers.
+
+    It is given numbers: of names it says that it replaces them, and it may take one that another marker has.
+    """
     text = path.read_text(errors="replace")
     if len(re.findall(r"^\s*NDIME\s*=", text, re.MULTILINE)) > 1:
         raise meshio.ReadError("more than one zone")
-    mesh = _of_text(text, "su2")
-    number = 0
-    mesh.cell_tags = {}
-    for name in re.findall(r"^\s*MARKER_TAG\s*=\s*(\S+)", text, re.MULTILINE):
-        number = int(name) if re.fullmatch(r"-?\d+", name) else number + 1
-        mesh.cell_tags.setdefault(number, []).append(name)
+    names: list[str] = []
+
+    def numbered(line: re.Match[str]) -> str:
+        names.append(line[2])
+        return f"{line[1]}{len(names)}"
+
+    mesh = _of_text(re.sub(r"^(\s*MARKER_TAG\s*=[ \t]*)(\S+).*$", numbered, text, flags=re.MULTILINE), "su2")
+    mesh.cell_tags = {number: [name] for number, name in enumerate(names, 1)}
     return mesh
 
 
