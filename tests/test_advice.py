@@ -30,7 +30,7 @@ TABLES = {
     "time": Time, "output": Output, "checkpoint": Checkpoint, "coupling": Coupling, "fluid": (MacFluid, SphFluid),
 }  # fmt: skip
 #: What looks like a key.
-NOT_KEYS = {"fluid.xdmf", "fluid.py"}
+NOT_KEYS = {"fluid.xdmf", "fluid.py", "output.txt"}
 
 
 def test_every_key_that_a_message_names_is_one():
