@@ -162,7 +162,7 @@ ABAQUS = """** a comment
 2, 1.0D0, 0.
 3, 1., 1., 0.
 4, 0., 1.,
-*INCLUDE, INPUT=cells.txt
+*INCLUDE, INPUT=./cells.txt
 *Element, type=SPRINGA
 9, 1, 2
 *NSET, NSET="left side", GENERATE
@@ -202,6 +202,8 @@ def test_abaqus_with_all_that_it_allows(tmp_path):
         ("*ELEMENT, TYPE=CPS3\n1, 2, 3, 99", "nodes that the file does not hold"),
         ("*INCLUDE, INPUT=none.txt", "it needs none.txt, which is not beside it"),
         ("*INCLUDE, INPUT=m.inp", "at most 5 files deep"),
+        ("*INCLUDE, INPUT=.", "beside the file"),
+        ("*INCLUDE, INPUT=../m.inp", "beside the file"),
     ],
 )
 def test_abaqus_that_would_be_misread_is_refused(tmp_path, card, why):

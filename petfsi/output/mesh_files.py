@@ -20,7 +20,7 @@ from petfsi.scene.tables import Shape
 DIRECTORY = "meshes"
 #: Of a format in two files, the endings that belong together.
 _PAIRS = ({".node", ".ele"},)
-_INCLUDED = re.compile(r"^\*INCLUDE\s*,\s*INPUT\s*=\s*\"?([^\s,\"/\\]+)", re.IGNORECASE | re.MULTILINE)
+_INCLUDED = re.compile(r"^\*INCLUDE\s*,\s*INPUT\s*=\s*\"?(?:\./)*([^\s,\"/\\]+)", re.IGNORECASE | re.MULTILINE)
 _HDF5_ITEM = re.compile(r"([^\s<>:/\\]+\.(?:h5|hdf5|bin))\s*:?")
 
 
@@ -119,7 +119,7 @@ def _with_companions(path: Path) -> list[Path]:
     ending = path.suffix.lower()
     others = {path.with_suffix(e) for pair in _PAIRS if ending in pair for e in pair - {ending}}
     if ending in (".xdmf", ".xmf"):
-        others |= {path.with_name(name) for name in _HDF5_ITEM.findall(path.read_text(errors="replace"))}
+        others |= {path.parent / name for name in _HDF5_ITEM.findall(path.read_text(errors="replace"))}
     if ending in (".inp", ".msh"):
         others |= _included(path)
     return [path, *sorted(other for other in others if other.is_file() and other != path)]
@@ -131,7 +131,7 @@ def _included(path: Path) -> set[Path]:
     rest = [path]
     while rest:
         text = rest.pop().read_text(errors="replace")
-        new = {path.with_name(name) for name in _INCLUDED.findall(text)} - found
+        new = {path.parent / name for name in _INCLUDED.findall(text)} - found
         found |= new
         rest += [other for other in new if other.is_file()]
     return found

@@ -144,7 +144,7 @@ def _cards(path: Path, depth: int) -> Iterator[Card]:
         if word.upper() != "INCLUDE":
             yield " ".join(word.upper().split()), given, lines[begin + 1 : end]
             continue
-        name = given.get("INPUT", "")
+        name = str(Path(given.get("INPUT", "")))  # without ./
         if depth == DEPTH or Path(name).name != name:
             raise meshio.ReadError(f"*INCLUDE of {name}: at most {DEPTH} files deep, and beside the file")
         yield from _cards(path.with_name(name), depth + 1)
