@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from petfsi.sweeps.opened import OpenedRun, OpenedSweep
+    from petfsi.output.opened import OpenedRun
+    from petfsi.sweeps.opened import OpenedSweep
 
 __version__ = "0.1.0"
 
 
 def open_run(directory: Path | str) -> OpenedRun:
     """Return a run directory to read from: ``history``, ``summary`` and ``scene``. Starts neither MPI nor PETSc."""
-    from petfsi.sweeps.opened import OpenedRun
+    from petfsi.output.opened import OpenedRun
 
     return OpenedRun(directory)
 

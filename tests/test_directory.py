@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blocks import falling_block
 from mpi4py import MPI
 from processes import environment
 
@@ -18,23 +19,8 @@ from petfsi.scene.load import load_scene
 from petfsi.simulation import Simulation
 from petfsi.solving.option_database import load_options
 
-BLOCK = """
-dim = 2
-gravity = [0.0, -1.0]
-[time]
-end = 0.6
-dt = 0.1
-[solids.block]
-shape = { mesh = "square.vtu" }
-density = 20.0
-young = 1e4
-poisson = 0.3
-supports = [{ where = "left", fix = ["x", "y"] }]
-[output]
-every = 0.2
-[checkpoint]
-every = 0.2
-"""
+EVERY = "[output]\nevery = 0.2\n[checkpoint]\nevery = 0.2"
+BLOCK = falling_block(0.6, 0.1, shape='{ mesh = "square.vtu" }', more=EVERY)
 CHANNEL = """
 dim = 2
 [time]

@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from blocks import falling_block
 from mpi4py import MPI
 from processes import environment
 
@@ -24,22 +25,8 @@ from petfsi.runs.stop import SIGNALS, Stop, process_age
 
 PETFSI = Path(sys.executable).with_name("petfsi")
 
-#: A block held by its left side falls: twelve steps without a fluid.
-SCENE = """
-dim = 2
-gravity = [0.0, "GRAVITY"]
-[time]
-end = 0.6
-dt = 0.05
-[solids.block]
-shape = { box = { origin = [0.0, 0.0], size = [1.0, 1.0], cells = [2, 2] } }
-density = 20.0
-young = 1e4
-poisson = 0.3
-supports = [{ where = "left", fix = ["x", "y"] }]
-[checkpoint]
-every = 0.2
-"""
+#: Twelve steps.
+SCENE = falling_block(0.6, 0.05, '[0.0, "-1 - t"]', more="[checkpoint]\nevery = 0.2")
 
 
 @pytest.fixture
@@ -54,7 +41,7 @@ def handlers():
 def here(tmp_path, monkeypatch, capfd, handlers):
     """Return a function that runs a command in this process and returns its exit code and all that it said."""
     monkeypatch.chdir(tmp_path)
-    Path("block.toml").write_text(SCENE.replace("GRAVITY", "-1 - t"))
+    Path("block.toml").write_text(SCENE)
 
     def run(*words):
         capfd.readouterr()

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blocks import falling_block
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import environment
@@ -30,23 +31,13 @@ from petfsi.sweeps.states import look_at
 
 ROOT = Path(__file__).parents[1]
 STUB = [sys.executable, "-S", "-E", str(Path(__file__).with_name("sweep_stub.py"))]
-SCENE = """
-dim = 2
-gravity = [0.0, -1]
-[time]
-end = 0.2
-dt = 0.05
-[solids.block]
-shape = { box = { origin = [0.0, 0.0], size = [1.0, 1.0], cells = [2, 2] } }
-density = 20.0
-young = 1e4
-poisson = 0.3
-supports = [{ where = "left", fix = ["x", "y"] }]
+PROBE = """
 [probes.top]
 of = "block"
 at = [0.5, 1.0]
 quantity = "displacement"
 """
+SCENE = falling_block(0.2, 0.05, more=PROBE)
 
 
 @pytest.fixture

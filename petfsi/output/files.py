@@ -15,6 +15,8 @@ from petfsi.ranks import on_root
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+#: Marks a directory as a run: a scene and options alone may be somebody's own.
+RUN_MARKER = ".petfsi-run"
 _CHUNK = 1 << 24
 _NO_FILE = "no plain file"
 

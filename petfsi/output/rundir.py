@@ -17,6 +17,7 @@ from petfsi.errors import InputError
 from petfsi.output import files
 from petfsi.output.aside import Aside
 from petfsi.output.checkpoint import change_records
+from petfsi.output.files import RUN_MARKER
 from petfsi.output.history import known_rows
 from petfsi.output.lock import NAME as LOCK
 from petfsi.output.manifest import FORMAT, Leg, Record
@@ -24,8 +25,6 @@ from petfsi.output.mesh_files import DIRECTORY, MeshFile, changed_meshes, copy_m
 from petfsi.ranks import on_root
 from petfsi.scene.changes import settings
 
-#: Marks a directory as a run: a scene and options alone may be somebody's own.
-MARKER = ".petfsi-run"
 #: Set aside while a run is under way, so that a full disk still takes its last words (bytes).
 RESERVE, RESERVE_BYTES = ".reserve", 16384
 #: What a sweep puts into the directory of a run before that begins.
@@ -189,16 +188,16 @@ class RunDirectory:
         return known.model_copy(update={"scene": (scene,), "options": (options,), "settings": now, "legs": legs})
 
     def _is_run(self) -> bool:
-        return (self.path / MARKER).is_file()
+        return (self.path / RUN_MARKER).is_file()
 
     def _check_run(self) -> None:
         if not self._is_run():
-            raise InputError(f"{self.path} is not the directory of a run: it has no {MARKER}")
+            raise InputError(f"{self.path} is not the directory of a run: it has no {RUN_MARKER}")
         try:
-            about = json.loads(files.read_plain(self.path / MARKER, MOST))
+            about = json.loads(files.read_plain(self.path / RUN_MARKER, MOST))
             number, version = about.get("format", 3), str(about.get("petfsi"))[:40]
         except (OSError, ValueError, AttributeError, RecursionError):
-            raise InputError(f"{self.path / MARKER} cannot be read") from None
+            raise InputError(f"{self.path / RUN_MARKER} cannot be read") from None
         if number != FORMAT:
             raise InputError(
                 f"run directory {self.path} is of format {str(number)[:20]}, by petfsi {version}; this petfsi goes on "
@@ -236,7 +235,7 @@ class RunDirectory:
         staged, aside, old = self.path / STAGED, None, b""
         try:
             if self._is_run():
-                old = files.read_plain(self.path / MARKER, MOST)
+                old = files.read_plain(self.path / RUN_MARKER, MOST)
             self.path.mkdir(parents=True, exist_ok=True)
             if not old:  # first of all, so that what a crash leaves is still known to be ours
                 self._mark(meshes)
@@ -261,9 +260,9 @@ class RunDirectory:
                 aside.put_back()
             with suppress(OSError):
                 if old:
-                    files.replace_text(self.path / MARKER, old)
+                    files.replace_text(self.path / RUN_MARKER, old)
                 else:
-                    (self.path / MARKER).unlink(missing_ok=True)
+                    (self.path / RUN_MARKER).unlink(missing_ok=True)
                 for directory in made:
                     directory.rmdir()
             raise
@@ -271,11 +270,11 @@ class RunDirectory:
 
     def _mark(self, meshes: Sequence[MeshFile]) -> None:
         about = {"petfsi": petfsi.__version__, "format": FORMAT, "meshes": [mesh.mark.file for mesh in meshes]}
-        files.replace_text(self.path / MARKER, json.dumps(about) + "\n")
+        files.replace_text(self.path / RUN_MARKER, json.dumps(about) + "\n")
 
     def _written(self) -> Iterator[str]:
         """Return the names of what petfsi has written into a run, and of nothing else; the lock is not among them."""
-        for name in [*_FILES, *(name + ".part" for name in [*_FILES, MARKER])]:
+        for name in [*_FILES, *(name + ".part" for name in [*_FILES, RUN_MARKER])]:
             if os.path.lexists(self.path / name) and not _is_folder(self.path / name):
                 yield name
         for name, ours in _DIRECTORIES.items():
@@ -292,7 +291,7 @@ class RunDirectory:
     def _own_meshes(self) -> list[str]:
         """Return the names of the mesh files that the run has copied."""
         try:
-            names = json.loads(files.read_plain(self.path / MARKER, MOST)).get("meshes", [])
+            names = json.loads(files.read_plain(self.path / RUN_MARKER, MOST)).get("meshes", [])
             return [name for name in names if _MESH.fullmatch(name)]
         except (OSError, ValueError, AttributeError, TypeError, RecursionError):
             return []

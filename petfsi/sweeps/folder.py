@@ -27,8 +27,6 @@ WRITING = ".writing"
 #: In a run's directory: which run of a sweep it is, and what it printed.
 RUN, OUTPUT = "run.json", "output.txt"
 RUNS, REPLACED = "runs", "replaced"
-#: Marks a run's directory once it has begun; who asks for that alone need not start MPI for it.
-BEGUN = ".petfsi-run"
 #: Bytes of the largest ``run.json``.
 _MOST = 16_000_000
 #: Runs, and keys of each, that a message names.

@@ -8,7 +8,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from petfsi.sweeps.folder import BEGUN, OUTPUT, SweepFolder
+from petfsi.output.files import RUN_MARKER
+from petfsi.sweeps.folder import OUTPUT, SweepFolder
 from petfsi.sweeps.plan import Planned
 
 #: What a launcher tells its own ranks, and a run that is none of them must not hear.
@@ -31,7 +32,7 @@ def run_words(folder: SweepFolder, run: Planned, step: int) -> list[str]:
         rest = [] if run.steps is None else ["--steps", str(run.steps - step)]
         return ["resume", directory, *rest]
     # what has begun there and left no checkpoint is nothing to keep; else there is nothing to overwrite
-    again = ["--overwrite"] if (folder.run(run.name) / BEGUN).exists() else []
+    again = ["--overwrite"] if (folder.run(run.name) / RUN_MARKER).exists() else []
     steps = [] if run.steps is None else ["--steps", str(run.steps)]
     return ["run", os.path.abspath(folder.path / run.scene), "--out", directory, *again, *steps, *run.options]
 
