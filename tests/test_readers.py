@@ -413,6 +413,26 @@ def test_what_a_reader_prints_is_told_and_not_printed(tmp_path, monkeypatch, cap
     assert notes == ["solids.b.shape.mesh: of 7 things one was odd"] and capfd.readouterr() == ("", "")
 
 
+HEAD = "ply\nformat ascii 1.0\ncomment TextureFile gone.jpg\nelement vertex {} \n" + "".join(
+    f"property float {x}\n" for x in "xyz"
+)
+CORNERS = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n"
+SIDES = "3 0 2 1 6 0 0 0 1 1 0\n3 0 1 3 6 0 0 0 1 1 0\n3 0 3 2 6 0 0 0 1 1 0\n3 1 2 3 6 0 0 0 1 1 0\n"
+LISTS = "property list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+
+
+def test_a_surface_whose_picture_is_not_there_is_read_without_a_word(tmp_path):
+    text = HEAD.format(4) + "element face 4\n" + LISTS + CORNERS + SIDES
+    read = mesh_files.open_mesh(Shape(mesh="s.ply"), "key", written(tmp_path / "s.ply", text).parent)
+    assert len(read.mesh.points) == 4 and read.notes == ()
+
+
+@pytest.mark.parametrize("text", [HEAD.format(0) + "element face 0\n" + LISTS, HEAD.format(1) + "element face 1\n" + LISTS + "0 0 0\n"])
+def test_words_of_python_are_told_as_what_the_file_is_not(tmp_path, text):
+    with pytest.raises(InputError, match=r"\(ply: it is not as this format should be"):
+        mesh_files.open_mesh(Shape(mesh="s.ply"), "key", written(tmp_path / "s.ply", text).parent)
+
+
 # ---- a channel with a flag ----------------------------------------------------------------------------------
 
 CHANNEL = """

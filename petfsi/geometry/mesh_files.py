@@ -133,18 +133,19 @@ def _tried(read: Reader, path: Path, size: int) -> Opened | str:
 
 def _check_arrays(mesh: meshio.Mesh) -> None:
     """Raise unless points, cells and groups are arrays of the forms that they should have."""
+    import meshio
     from meshio._common import num_nodes_per_cell
 
     mesh.points = np.asarray(mesh.points, dtype=float)
     if mesh.points.ndim != 2 or mesh.points.shape[1] not in (1, 2, 3):
-        raise ValueError("points without two or three coordinates each")
+        raise meshio.ReadError("points without two or three coordinates each")
     for block in mesh.cells:
         if block.type in KINDS and len(block.data):
             nodes = num_nodes_per_cell.get(block.type, block.data.shape[-1])
             if block.data.ndim != 2 or block.data.shape[1] != nodes or not np.issubdtype(block.data.dtype, np.integer):
-                raise ValueError(f"cells of type {block.type} that have not {nodes} nodes each")
+                raise meshio.ReadError(f"cells of type {block.type} that have not {nodes} nodes each")
             if block.data.min() < 0 or block.data.max() >= len(mesh.points):
-                raise ValueError("cells name points that the file does not hold")
+                raise meshio.ReadError("cells name points that the file does not hold")
     lengths = [len(block.data) for block in mesh.cells]
     for name, sets in mesh.cell_sets.items():
         for chosen, length in zip(sets, lengths, strict=True):
@@ -154,13 +155,17 @@ def _check_arrays(mesh: meshio.Mesh) -> None:
 
 
 def _check_numbers(name: str, chosen: np.ndarray | None, length: int) -> None:
+    import meshio
+
     numbers = np.asarray([] if chosen is None else chosen).ravel()
     if len(numbers) and (numbers.min() < 0 or numbers.max() >= length):
-        raise ValueError(f"group {name!r} has members that the file does not hold")
+        raise meshio.ReadError(f"group {name!r} has members that the file does not hold")
 
 
 def _reason(error: BaseException, said: list[str]) -> str:
     """Return why a reader failed."""
+    import meshio
+
     if isinstance(error, ImportError):
         return f"reading it takes the Python package {error.name}, which is not there"
     if isinstance(error, UnicodeDecodeError):
@@ -171,11 +176,14 @@ def _reason(error: BaseException, said: list[str]) -> str:
         return f"it names {error.args[0]!r}, which it does not hold or which is not known"
     if isinstance(error, FileNotFoundError):
         return f"it needs {Path(error.filename).name}, which is not beside it" if error.filename else str(error)
-    text = " ".join([" ".join(str(error).split()) * (not isinstance(error, SystemExit)), *said]).strip()
-    return text or "it is not as this format should be"
+    words = " ".join([" ".join(str(error).split()) * (not isinstance(error, SystemExit)), *said]).strip()
+    if isinstance(error, (meshio.ReadError, SystemExit)) and words:
+        return words
+    # what a reader meets where it looks for something else, in words of Python or NumPy
+    return f"it is not as this format should be: {words}" if words else "it is not as this format should be"
 
 
 def _lines(said: io.StringIO) -> list[str]:
-    """Return what was printed as one line, if anything."""
-    text = " ".join(said.getvalue().split())
+    """Return what was printed as one line, if anything, without where in the reader it was."""
+    text = " ".join(said.getvalue().partition("Traceback (most recent call last)")[0].split())
     return [text] if text else []

@@ -238,6 +238,12 @@ def find_checkpoint(directory: Path, comm: MPI.Comm, report: Callable[[str], Non
     return info
 
 
+def newest_checkpoint(directory: Path) -> Path | None:
+    """Return the newest checkpoint that looks whole, its data not read; None without one. Not collective."""
+    every = (_inspect(Path(directory), number, thorough=False) for number in reversed(_numbers(Path(directory))))
+    return next((found.path for found in every if isinstance(found, CheckpointInfo)), None)
+
+
 def last_good(directory: Path, comm: MPI.Comm) -> str:
     """Return a sentence that names the newest checkpoint that is whole. Collective."""
     info = find_checkpoint(directory, comm, lambda _line: None)

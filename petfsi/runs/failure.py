@@ -11,7 +11,7 @@ from petfsi.errors import EnergyError, InputError, NoSolutionError, SolveError, 
 #: What a file system without room answers.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: Kinds that say nothing about the scene: the same run may well get further the next time.
-NO_RESULT = ("interrupted", "killed", "disk", "memory", "defect")
+NO_RESULT = ("interrupted", "disk", "memory", "defect")
 #: Characters of a message that are kept.
 _MOST = 2000
 

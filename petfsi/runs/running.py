@@ -72,6 +72,7 @@ class Run:
             self.writer.go_on(self.known, after, self.fields, self.console.warn)
             self.effort = earlier_effort(self.files, after, self.comm, self.console.note)
             self._saved = after
+            self.probes = self._read_probes()
 
     @contextmanager
     def recorded(self) -> Iterator[None]:
@@ -100,7 +101,7 @@ class Run:
 
     def _failure(self, error: BaseException) -> dict[str, Any]:
         """Return what the summary says of a failure. Not collective."""
-        newest = max(self.files.checkpoints.glob("*.h5"), default=None)
+        newest = newest_checkpoint(self.files.checkpoints)
         where = "" if newest is None else str(newest.relative_to(self.files.path))
         return describe_failure(error, self._taking, self.simulation.time, where)
 
@@ -207,10 +208,14 @@ class Run:
             return simulation.fluid.tally()
         return {"volume_error": simulation.volume_error, "divergence": simulation.divergence()}
 
+    def _read_probes(self) -> dict[str, float]:
+        """Return what the probes show now, by column. Collective."""
+        return dict(zip(self.simulation.probe_columns(), self.simulation.probe(), strict=True))
+
     def append_row(self) -> None:
         """Add the present state to the history. Collective."""
         simulation = self.simulation
-        self.probes = dict(zip(simulation.probe_columns(), simulation.probe(), strict=True))
+        self.probes = self._read_probes()
         self.history.append(
             {
                 "step": simulation.step,

@@ -100,7 +100,8 @@ def _by_meshio(name: str, path: Path, notes: list[str]) -> meshio.Mesh:
 def _by_trimesh(path: Path, notes: list[str]) -> meshio.Mesh:
     import trimesh
 
-    surface = trimesh.load_mesh(path, process=False)
+    # no pictures, of which it tells in tracebacks that they are not there, and points as they are in the file
+    surface = trimesh.load_mesh(path, process=False, skip_materials=True, fix_texture=False)
     if not len(surface.faces):  # it reads what is no mesh as one without faces
         raise meshio.ReadError("no faces")
     return meshio.Mesh(np.asarray(surface.vertices), [("triangle", np.asarray(surface.faces))])
