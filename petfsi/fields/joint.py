@@ -68,6 +68,8 @@ class JointSolid(SolidField):
         self._pieces = [slice(end - n, end) for end, n in zip(ends, counts, strict=True)]
         self.layout = Layout.of(comm, int(ends[-1]))
         self._number = stacked_numbers(comm, counts)
+        whose = zip(self._scene_numbers(), self.parts, strict=True)
+        self.owner = np.concatenate([number[part.owner] for number, part in whose])
         self.rhs = np.zeros(self.layout.n_local)
         self.moved = np.zeros(self.layout.n_local)
         acting = {name for part in self.parts for name in part.acting}
@@ -252,9 +254,12 @@ class JointSolid(SolidField):
 
     def surface_bodies(self) -> np.ndarray:
         """Return the body of each of its points as numbered in the scene."""
-        numbers = [np.array([self.names.index(name) for name in part.names]) for part in self.parts]
-        every = zip(numbers, self.parts, strict=True)
+        every = zip(self._scene_numbers(), self.parts, strict=True)
         return np.concatenate([number[part.surface_bodies()] for number, part in every])
+
+    def _scene_numbers(self) -> list[np.ndarray]:
+        """Return the numbers in the scene of each part's bodies."""
+        return [np.array([self.names.index(name) for name in part.names]) for part in self.parts]
 
     def surface_rooted(self) -> np.ndarray:
         """Return which of its points supports hold where they are, along all axes."""

@@ -46,6 +46,8 @@ class SolidField(Field):
     ----------
     names : list of str
         The bodies, in the order of the scene.
+    owner : ndarray of int, shape (layout.n_local,)
+        Which of them each unknown of this rank belongs to.
     extent : float
         Largest side of its bounding box at rest, m.
     moved : ndarray, shape (layout.n_local,)
@@ -60,6 +62,7 @@ class SolidField(Field):
 
     elastic = True
     names: list[str]
+    owner: np.ndarray
     extent: float
     moved: np.ndarray
     acting: tuple[str, ...] = ()

@@ -73,9 +73,13 @@ def _cell(fluid: Fluid) -> np.ndarray:
 
 
 def _across(form: Form, cell: np.ndarray) -> np.ndarray:
-    """Return how many cells a solid, of a hollow one its wall, is across along each of its axes."""
+    """Return how many cells a solid, of a hollow one its wall, is across between its faces along each of its axes.
+
+    Between two faces with the normal n, L apart, that are  L / |(n_x h_x, n_y h_y, ...)|  cells of sides h: where cells
+    are no squares, the distance of the faces where cells are drawn as such.
+    """
     lengths = np.concatenate(([form.thickness], form.lengths[1:]))
-    return lengths * np.linalg.norm(form.axes / cell, axis=1)
+    return lengths / np.linalg.norm(form.axes * cell, axis=1)
 
 
 def nowhere_to_go(view: View) -> Notes:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from petfsi.errors import InputError
 from petfsi.geometry.beams import axis_mesh
@@ -17,6 +18,8 @@ from petfsi.scene.tables import Ball, Beam, Box
 
 #: A body whose volume is that of its box up to this is taken for one: a ring, a frame or a cross is not.
 BOX_LIKE = (0.75, 1.3)
+#: Of a plate whose two long sides differ by less than this factor, the second moments say too little of which they are.
+ALIKE = 0.9
 #: Shorter than so many thicknesses nothing bends as a beam.
 SLENDER = 3.0
 #: Nodes of a box along each axis, of which no more stand for all of them, by dimension.
@@ -165,11 +168,33 @@ def _mesh(points: np.ndarray, cells: np.ndarray) -> Form:
     corners = corners - volumes @ corners.mean(axis=1) / volume
     total = corners.sum(axis=1)
     moments = np.einsum("e,eia,eib->ab", volumes, corners, corners) + np.einsum("e,ea,eb->ab", volumes, total, total)
-    squares, ways = np.linalg.eigh(moments / ((dim + 1) * (dim + 2) * volume))
-    lengths = np.sqrt(12.0 * np.maximum(squares, 0.0))
+    sizes, ways = np.linalg.eigh(moments)  # the squares of lengths, but for a factor
+    if dim == 3 and sizes[1] > ALIKE**2 * sizes[2]:
+        ways[:, 1:] = ways[:, 1:] @ _sides(points[np.unique(cells)] @ ways[:, 1:])
+    # of thin ones the least eigenvalue is round-off of the largest; along the axis itself it is not
+    squares = volumes @ ((corners @ ways) ** 2).sum(axis=1) + volumes @ (total @ ways) ** 2
+    order = np.argsort(squares, kind="stable")
+    ways, lengths = ways[:, order], np.sqrt(12.0 * squares[order] / ((dim + 1) * (dim + 2) * volume))
     step = (math.factorial(dim) * volume / len(cells)) ** (1 / dim)
     filled = BOX_LIKE[0] < volume / lengths.prod() < BOX_LIKE[1]
     return Form(ways.T, lengths, np.full(dim, step), _altitude(corners, volumes), float(lengths[0]), filled, points)
+
+
+def _sides(points: np.ndarray) -> np.ndarray:
+    """Return the sides of the smallest rectangle around points of a plane, shape (n, 2), as unit columns, (2, 2).
+
+    It has a side along an edge of their hull. Second moments do not tell the sides of a square.
+
+    References
+    ----------
+    H. Freeman, R. Shapira, Determining the minimum-area encasing rectangle for an arbitrary closed curve (1975).
+    """
+    around = points[ConvexHull(points).vertices]
+    edges = np.roll(around, -1, axis=0) - around
+    x, y = (edges / np.linalg.norm(edges, axis=1, keepdims=True)).T
+    areas = np.ptp(around @ (x, y), axis=0) * np.ptp(around @ (-y, x), axis=0)
+    best = int(np.argmin(areas))
+    return np.array([[x[best], -y[best]], [y[best], x[best]]])
 
 
 def _altitude(corners: np.ndarray, volumes: np.ndarray) -> float:

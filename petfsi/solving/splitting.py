@@ -23,12 +23,15 @@ MOST = 1e150
 
 
 class SplitWatch:
-    """Watches the equations of the solid, which a splitting scheme solves under the old pressure.
+    """Watches the equations of each body, which a splitting scheme solves under the old pressure.
 
-    What is left of them is the change of the pressure, J (p - p_old). Where the fluid that moves with the solid
-    outweighs it (its added mass m_a exceeds m), the pressure of a step pushes back what the last one pushed too far:
-    what is left turns round in every step and grows by about m_a / m, and a step is worse than none, |b - Kx| > |b|.
-    A load that sets in leaves more and more, too, at whatever rate, but all of it in one direction.
+    What is left of them is the change of the pressure, J (p - p_old). Where the fluid that moves with a body outweighs
+    it (its added mass m_a exceeds m), the pressure of a step pushes back what the last one pushed too far: what is
+    left turns round in every step and grows by about m_a / m, and a step is worse than none, |b - Kx| > |b|. Every mode
+    that grows does so by a negative factor, whatever its stiffness and damping. A load that sets in leaves more and
+    more, too, at whatever rate, but all of it in one direction.
+
+    Each body is judged by its own equations: beside what a heavy one bears, an unstable light one is nothing in a sum.
 
     Parameters
     ----------
@@ -44,14 +47,15 @@ class SplitWatch:
 
     def forget(self) -> None:
         """Begin anew."""
-        # what the last steps left, as far back as each left more than the one before it, and more than its |b|
-        self._left: list[float] = []
+        # by body what the last steps left, the last one's last, as far back as each left more than the one before it,
+        # and more than its |b|; zeros before
+        self._left = np.zeros((len(self._solid.names), 1 + PATIENCE))
         self._residual = np.zeros(self._solid.layout.n_local)
 
     @property
-    def rises(self) -> int:
-        """How many of the last steps turned round and left more than the one before; ``PATIENCE`` at most."""
-        return max(len(self._left) - 1, 0)
+    def rises(self) -> np.ndarray:
+        """How many of the last steps of each body turned round and left more than the one before; at most PATIENCE."""
+        return np.maximum(np.count_nonzero(self._left, axis=1) - 1, 0)
 
     def judge(self, system: System) -> None:
         """Look at the step just solved, before it is accepted. Collective.
@@ -59,42 +63,56 @@ class SplitWatch:
         Raises
         ------
         FinalError
-            On all ranks, if what is left has risen often enough: shorter steps are the worst case.
+            On all ranks, if what is left of a body has risen often enough: shorter steps are the worst case.
         """
         rows = system.piece("solid")
         r, b, old = system.residual.array_r[rows], system.rhs.array_r[rows], self._residual
-        sums = system.comm.allreduce(np.array([r @ r, b @ b, r @ old, old @ old]))
-        left, size, before = np.sqrt(sums[[0, 1, 3]]).tolist()
-        turned = float(sums[2]) < TURNED * left * before
-        if self._left and not (turned and left > max(size, RISE * self._left[-1])):
-            self._left = []
-        self._left = [*self._left[-PATIENCE:], left] if left > 0 else []
+        # of each body r.r, b.b, r.old and old.old
+        with np.errstate(over="ignore"):  # what blows up is told of by others
+            products = [self._by_body(x) for x in (r * r, b * b, r * old, old * old)]
+        sums = system.comm.allreduce(np.array(products))
+        left, size, before = np.sqrt(sums[[0, 1, 3]])
+        turned = sums[2] < TURNED * left * before
+        last = self._left[:, -1]
+        goes_on = turned & (last > 0) & (left > np.maximum(size, RISE * last))
+        self._left = np.column_stack((np.where(goes_on[:, None], self._left[:, 1:], 0.0), left))
         self._residual = r.copy()
-        if self._stops and self.rises >= PATIENCE:
+        if self._stops and self.rises.max() >= PATIENCE:
             raise FinalError(self.story())
 
+    def _by_body(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum over this rank's unknowns of each body."""
+        return np.bincount(self._solid.owner, weights=values, minlength=len(self._solid.names))
+
     def story(self) -> str:
-        """Return that splitting is what fails, if it is: what it left has risen in the last step at least."""
-        if not self.rises:
+        """Return that splitting is what fails, if it is: what it left of a body has risen in the last step at least.
+
+        Risen once may be what another body sets off that meets something, which then leaves more.
+        """
+        rises, left = self.rises, self._left[:, -1]
+        counts = (rises > 1) | ((rises == 1) & (left == left.max()))
+        if not counts.any():
             return ""
+        worst = int(np.lexsort((left, rises, counts))[-1])  # of those that rose most often what left most
+        n = int(rises[worst])
+        name, first = self._solid.names[worst], self._left[worst, -1 - n]
         return (
-            f"time splitting is unstable here: what it leaves over in the solid's equations, |b - Kx|, has risen from "
-            f"{self._left[0]:.1e} to {self._left[-1]:.1e} in {self.rises} step{'s' * (self.rises > 1)}. The fluid that "
-            f"moves with the solid outweighs it (added mass), and smaller steps make that worse. Start again with "
-            f"-options_file monolithic.opts; split-iterated.opts holds only where the solid's stiffness and damping in "
-            f"a step outweigh that fluid"
+            f"time splitting is unstable here: what it leaves over in the equations of solids.{name}, |b - Kx|, has "
+            f"risen from {first:.1e} to {left[worst]:.1e} in {n} step{'s' * (n > 1)}. The fluid that moves with the "
+            f"solid outweighs it (added mass), and smaller steps make that worse. Start again with -options_file "
+            f"monolithic.opts; split-iterated.opts holds only where the solid's stiffness and damping in a step "
+            f"outweigh that fluid"
         )
 
     def state(self) -> State:
         """Return what the next step is judged by. Collective."""
-        left = [*self._left, *[0.0] * (1 + PATIENCE - len(self._left))]
-        first = self._comm.rank == 0
-        sizes = Slab(np.array(left if first else []), (0 if first else len(left),), (len(left),))
-        return {"left": sizes, **self._solid.stored("residual", self._residual)}
+        mine = self._left if self._comm.rank == 0 else self._left[:0]
+        left = Slab(mine, (len(self._left) - len(mine), 0), self._left.shape)
+        return {"left_by_body": left, **self._solid.stored("residual", self._residual)}
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
-        left = np.asarray(read("left", (0,), (1 + PATIENCE,)), dtype=float)
+        left = np.asarray(read("left_by_body", (0, 0), self._left.shape), dtype=float)
         residual = self._solid.read_stored(read, "residual")
-        refuse(self._comm, [outside("left", left, 0.0, MOST), outside("residual", residual, -MOST, MOST)])
-        self._left, self._residual = [float(value) for value in left if value], residual
+        refuse(self._comm, [outside("left_by_body", left, 0.0, MOST), outside("residual", residual, -MOST, MOST)])
+        self._left, self._residual = left, residual

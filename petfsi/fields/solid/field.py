@@ -65,6 +65,8 @@ class NodalSolid(SolidField):
     ----------
     names : list of str
         The bodies, in the order of the scene.
+    owner : ndarray of int, shape (layout.n_local,)
+        Which of them each unknown of this rank belongs to.
     width : int
         Unknowns a node.
     extent : float
@@ -97,6 +99,7 @@ class NodalSolid(SolidField):
         self.reference = self._mesh.points[:n_owned]
         self._exchange = NodalExchange(comm, self._mesh, self._number)
         self.layout = Layout.of(comm, self.width * n_owned)
+        self.owner = np.repeat(self._node_body[self._mesh.natural[:n_owned]], self.width)
         self._elements = self._make_elements(solids)
         self._uniform = self._elements.uniform_load(n_owned)
         gravity = Gravity(scene.gravity or [], self._uniform)
