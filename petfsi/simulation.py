@@ -344,7 +344,7 @@ class Simulation:
         if self.stable.limited:
             kept["stable"] = held(self.stable.state(self.comm))
         if self.splitting is not None:
-            kept["splitting"] = held(self.splitting.state())
+            kept["splitting"] = self.splitting.keep()
         return kept
 
     def restore(self, step: int, time: float, dt: float, group: Callable[[str], Reader]) -> None:

@@ -427,7 +427,9 @@ def test_a_surface_whose_picture_is_not_there_is_read_without_a_word(tmp_path):
     assert len(read.mesh.points) == 4 and read.notes == ()
 
 
-@pytest.mark.parametrize("text", [HEAD.format(0) + "element face 0\n" + LISTS, HEAD.format(1) + "element face 1\n" + LISTS + "0 0 0\n"])
+@pytest.mark.parametrize(
+    "text", [HEAD.format(0) + "element face 0\n" + LISTS, HEAD.format(1) + "element face 1\n" + LISTS + "0 0 0\n"]
+)
 def test_words_of_python_are_told_as_what_the_file_is_not(tmp_path, text):
     with pytest.raises(InputError, match=r"\(ply: it is not as this format should be"):
         mesh_files.open_mesh(Shape(mesh="s.ply"), "key", written(tmp_path / "s.ply", text).parent)

@@ -299,7 +299,7 @@ def test_bodies_are_judged_alike_on_any_number_of_ranks_and_go_on_so(light):
         with prepared(scene, *SPLITS, comm=COMM) as alone:
             for _ in range(2):
                 alone.advance()
-        assert arrays["splitting"]["left_by_body"] == pytest.approx(alone.splitting.state()["left_by_body"].data, 1e-4)
+        assert arrays["splitting"]["left_by_body"] == pytest.approx(alone.splitting.keep()()["left_by_body"].data, 1e-4)
         straight.forget()
         again.restore(straight.step, straight.time, straight.dt, lambda group: reader(arrays[group]))
         ends = [until_it_stops(sim, 10) for sim in (straight, again)]

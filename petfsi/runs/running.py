@@ -101,7 +101,7 @@ class Run:
 
     def _failure(self, error: BaseException) -> dict[str, Any]:
         """Return what the summary says of a failure. Not collective."""
-        newest = newest_checkpoint(self.files.checkpoints)
+        newest = checkpoints.newest_checkpoint(self.files.checkpoints)
         where = "" if newest is None else str(newest.relative_to(self.files.path))
         return describe_failure(error, self._taking, self.simulation.time, where)
 

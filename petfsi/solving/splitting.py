@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from mpi4py import MPI
 
@@ -104,11 +106,12 @@ class SplitWatch:
             f"outweigh that fluid"
         )
 
-    def state(self) -> State:
-        """Return what the next step is judged by. Collective."""
-        mine = self._left if self._comm.rank == 0 else self._left[:0]
-        left = Slab(mine, (len(self._left) - len(mine), 0), self._left.shape)
-        return {"left_by_body": left, **self._solid.stored("residual", self._residual)}
+    def keep(self) -> Callable[[], State]:
+        """Return what gives the state of now, by which the next step is judged; that is collective."""
+        left, residual = self._left, self._residual  # each step makes new ones
+        mine = left if self._comm.rank == 0 else left[:0]
+        slab = Slab(mine, (len(left) - len(mine), 0), left.shape)
+        return lambda: {"left_by_body": slab, **self._solid.stored("residual", residual)}
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
