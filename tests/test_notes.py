@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from step_cases import loaded, prepared
 
-from petfsi.notes.bending import SLOWEST, Span, bending_period, excess, wave_time, widest_span
+from petfsi.notes.bending import SHEARED, SLOWEST, Span, bending_period, wave_time, widest_span
 from petfsi.notes.forms import form_of, held
 from petfsi.notes.notes import find_notes
 from petfsi.notes.solids import _steps
@@ -249,6 +249,8 @@ PIN = {"where": {"box": {"origin": [-0.01, -0.01], "size": [0.012, 0.012]}}, "fi
 ROLLER = {"where": {"box": {"origin": [0.995, -0.01], "size": [0.012, 0.012]}}, "fix": ["y"]}
 MIDDLE = {"where": {"box": {"origin": [0.49, -1.0], "size": [0.02, 2.0]}}, "fix": ["x", "y"]}
 RIGHT = {"where": "right", "fix": ["x", "y"]}
+X = {"where": "left", "fix": ["x"]}  # a plane of symmetry
+X_RIGHT = {"where": "right", "fix": ["x"]}
 START, END = ({"where": where, "fix": ["x", "y", "angle"]} for where in ("start", "end"))
 SLENDER = {"size": (1.0, 0.02), "cells": (100, 4)}
 SPANS = {
@@ -263,6 +265,16 @@ SPANS = {
     "a pinned beam": (
         beam([{"where": w, "fix": ["x", "y"]} for w in ("start", "end")]), math.hypot(0.6, 0.6), math.pi**2),
     "a clamped beam": (beam([START, END]), math.hypot(0.6, 0.6), 22.37),
+    "half of what is pinned": (bar(**SLENDER, supports=[X, ROLLER]), 2.0, math.pi**2),
+    "half of what is clamped": (bar(**SLENDER, supports=[X, RIGHT]), 2.0, 22.37),
+    "half of what is free": (bar(**SLENDER, supports=[X]), 2.0, 22.37),
+    "between planes of symmetry": (bar(**SLENDER, supports=[X, X_RIGHT]), 1.0, math.pi**2),
+    "half of a pinned beam": (
+        beam([{"where": "start", "fix": ["angle"]}, {"where": "end", "fix": ["x", "y"]}]),
+        2 * math.hypot(0.6, 0.6), math.pi**2),
+    "held along a half of it": (
+        bar((400, 1), (1.0, 0.002), [{"where": {"box": {"origin": [-0.1, -0.1], "size": [0.6, 1.0]}}, "fix": ["y"]}]),
+        0.5, 3.516),
 }  # fmt: skip
 
 
@@ -299,21 +311,6 @@ def test_a_wide_flap_is_warned_of_as_a_narrow_one_is():
         made = scene(bar((1, 10, 4), (0.05, 1.0, width), [{"where": "bottom", "fix": ALL}]), dim=3, dt=0.2)
         said = "".join(warned(made))
         assert "linear elements, 1 across it" in said and "its slowest bending takes about 3.9 s" in said
-
-
-X = {"where": "left", "fix": ["x"]}
-GUIDED = {
-    "a plane of symmetry": bar(**SLENDER, supports=[X, ROLLER]),
-    "two of them": bar(**SLENDER, supports=[X, X | {"where": "right"}]),
-    "a beam": beam([{"where": "start", "fix": ["angle"]}, {"where": "end", "fix": ["x", "y"]}]),
-}
-
-
-@pytest.mark.parametrize("solid", GUIDED.values(), ids=GUIDED)
-def test_of_ends_that_slide_but_do_not_turn_nothing_is_said(solid):
-    solid = scene(solid).solids["b"]
-    form = form_of(solid, 2, None)
-    assert widest_span(form, held(solid, form, Path())) is None
 
 
 def test_an_inflow_that_swings_is_seen_wherever_it_is_nothing_at_equal_times():
@@ -369,12 +366,32 @@ def swing(solid, dt, steps):
     return 2 * dt * float(np.diff(back).mean())
 
 
-def test_a_bar_swings_as_long_as_is_said_of_it():
-    thrown = bar(elements="quadratic", cells=(10, 1), initial={"velocity": [0.0, "1e-4*x**2"]})
+SWINGS = {
+    "a cantilever": (CLAMP, "1e-4*x**2", ("clamped", "free")),
+    "half of what is pinned": ([PIN | {"fix": ["y"]}, X_RIGHT], "1e-4*sin(pi*x/2)", ("guided", "pinned")),
+    "half of what is clamped": ([*CLAMP, X_RIGHT], "1e-4*(1-cos(pi*x))", ("clamped", "guided")),
+}
+
+
+@pytest.mark.parametrize(("supports", "speed", "ends"), SWINGS.values(), ids=SWINGS)
+def test_a_bar_swings_as_long_as_is_said_of_it(supports, speed, ends):
+    thrown = bar((10, 1), supports=supports, elements="quadratic", initial={"velocity": [0.0, speed]})
     solid = scene(thrown).solids["b"]
     form = form_of(solid, 2, None)
-    said = bending_period(solid, form, Span(1.0, ("clamped", "free")))
+    span = widest_span(form, held(solid, form, Path()))
+    assert span == Span(pytest.approx(1.0), ends, 1)
+    said = bending_period(solid, form, span)
     assert swing(thrown, said / 60, 130) == pytest.approx(said, rel=0.05)
+
+
+@pytest.mark.parametrize("end", ["clamped", "free", "pinned"])
+def test_half_of_a_short_bar_swings_as_long_as_all_of_it(end):
+    """As shear counts there; by symmetry the middle is a guided end."""
+    solid = scene(bar((40, 10), (1.0, 0.25))).solids["b"]
+    form = form_of(solid, 2, None)
+    half = Span(0.5, (min(end, "guided"), max(end, "guided")), 1)
+    whole = Span(1.0, (end, end), 1)
+    assert bending_period(solid, form, half) == pytest.approx(bending_period(solid, form, whole), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -393,74 +410,16 @@ def test_a_wave_crosses_an_element_at_the_speed_of_pressure(poisson):
     assert wave_time(solid, form_of(solid, 2, None)) == pytest.approx(0.02 / 2**0.5 / math.sqrt(modulus / 1000))
 
 
-STIFF = [
-    (2, 1, 20, {}), (2, 2, 40, {"poisson": 0.45}), (2, 2, 10, {}), (2, 1, 10, {"volumetric": "reduced"}),
-    (3, 1, 10, {"poisson": 0.49}), (3, 2, 20, {"poisson": 0.495}),
-    (3, 2, 20, {"volumetric": "reduced", "poisson": 0.49}),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("dim", "n", "along", "more"), STIFF)
-def test_linear_elements_lock_as_much_as_is_said_to_a_factor_of_two(dim, n, along, more):
-    length = 10.0
-    supports = [{"where": "left", "fix": ["x", "y", "z"][:dim]}]
-    loads = [{"where": "right", "traction": [0.0, 1e-3, 0.0][:dim], "follower": False}]
-    size, cells = (length, 1.0, 1.0)[:dim], (along, n, n)[:dim]
-    solid = bar(cells, size, supports, loads=loads, material="linear") | more
-    probe = {"of": "b", "at": [length, 0.5, 0.5][:dim], "quantity": "displacement"}
-    made = scene(solid, dim=dim, dt=1.0, time={"integrator": "static"}, probes={"tip": probe})
-    with prepared(made) as sim:
-        sim.advance()
-        tip = sim.probe()[1]
-    body = made.solids["b"]
-    young = 1e6 / (1 - body.poisson**2 if dim == 2 else 1)
-    exact = 1e-3 * (length**3 / (3 * young / 12) + length / (5 / 6 * 1e6 / (2 * (1 + body.poisson))))
-    assert 0.5 < excess(body, form_of(body, dim, None).bend(-1), dim, body.volumetric) / (exact / tip - 1) < 2.0
-
-
-#: Boxes of which a cavity leaves walls that are short, or thicker than its own box says; too stiff by less than half.
-HOLLOW = {
-    "a notch": ((9, 9), (1.0, 1.0), [0.7, 0.3], [0.25, 0.25]),
-    "a short wall": ((9, 9), (1.0, 1.0), [0.6, 0.3], [0.25, 0.25]),
-    "a thick wall": ((9, 9), (1.0, 1.0), [0.3, 0.3], [0.4, 0.4]),
-}
-
-
-@pytest.mark.parametrize(("cells", "size", "low", "wide"), HOLLOW.values(), ids=HOLLOW)
-def test_walls_are_those_that_the_mesh_has(cells, size, low, wide):
-    supports = [{"where": "bottom", "fix": ["x", "y"]}]
-    loads = [{"where": "top", "traction": [1.0, 0.0], "follower": False}]
-    body = bar(cells, size, supports, loads=loads, material="linear")
-    body["shape"] = body["shape"] | {"cavity": {"origin": low, "size": wide}}
-    probe = {"of": "b", "at": [0.0, 1.0], "quantity": "displacement"}
-    tips = []
-    for elements in ("linear", "quadratic"):
-        made = scene(body | {"elements": elements}, dt=1.0, time={"integrator": "static"}, probes={"tip": probe})
-        assert not warned(made)[0]
-        with prepared(made) as sim:
-            sim.advance()
-            tips.append(sim.probe()[0])
-    assert tips[1] / tips[0] < 1.5
-
-
-def test_what_is_advised_against_locking_helps():
-    """Of the case that is warned of most: 18 times too stiff."""
-    said = warned(WARNED["few across 3D"][0])[0]
-    assert 'elements = "quadratic"' in said and 'volumetric = "reduced" and 4 across' in said
-    clamp = [{"where": "left", "fix": ["x", "y", "z"]}]
-    helped = [
-        bar((20, 2, 2), (1.0, 0.1, 0.1), clamp, poisson=0.495, elements="quadratic"),
-        bar((40, 4, 4), (1.0, 0.1, 0.1), clamp, poisson=0.495, volumetric="reduced"),
-    ]
-    assert [warned(scene(solid, dim=3))[0] for solid in helped] == ["", ""]
-
-
 def test_the_table_of_slowest_bendings_solves_the_equations_of_beams():
     root = {ends: math.sqrt(c) for ends, c in SLOWEST.items()}
     for ends, sign in ((("clamped", "free"), 1), (("clamped", "clamped"), -1), (("free", "free"), -1)):
         assert math.cos(root[ends]) * math.cosh(root[ends]) == pytest.approx(-sign, abs=2e-2)
     for ends in (("clamped", "pinned"), ("free", "pinned")):
         assert math.tan(root[ends]) == pytest.approx(math.tanh(root[ends]), abs=1e-3)
+    for ends in (("clamped", "guided"), ("free", "guided")):
+        assert math.tan(root[ends]) == pytest.approx(-math.tanh(root[ends]), abs=1e-3)
+    assert math.cos(root["guided", "pinned"]) == pytest.approx(0.0) == math.sin(root["guided", "guided"])
+    assert math.tan(SHEARED["free", "pinned"]) == pytest.approx(SHEARED["free", "pinned"], rel=1e-2)
 
 
 def test_a_run_of_a_sound_scene_has_no_warning(tmp_path):

@@ -15,17 +15,30 @@ import numpy as np
 from petfsi.notes.forms import SLENDER, Bend, Form
 from petfsi.scene.solids import Solid
 
-#: c of the slowest bending that is no rigid motion, by how the ends are held, in the order of the alphabet.
+#: c of the slowest bending that is no rigid motion, by how the ends are held, in the order of the alphabet. A guided
+#: end slides and does not turn, as in a plane of symmetry. R. D. Blevins, Formulas for Natural Frequency (1979), ch. 8.
 SLOWEST = {
     ("clamped", "free"): 3.516,
     ("clamped", "clamped"): 22.373,
+    ("clamped", "guided"): 5.593,
     ("clamped", "pinned"): 15.418,
     ("free", "free"): 22.373,
+    ("free", "guided"): 5.593,
     ("free", "pinned"): 15.418,
+    ("guided", "guided"): math.pi**2,
+    ("guided", "pinned"): math.pi**2 / 4,
     ("pinned", "pinned"): math.pi**2,
 }
-#: Of a rectangular section, for shear.
-SHEAR = 5 / 6
+#: k of the same motion by shear alone, as sections that do not bend turn all alike:  omega = k/L sqrt(SHEAR G / rho).
+SHEARED = {
+    ("clamped", "free"): math.pi / 2,
+    ("clamped", "guided"): math.pi / 2,
+    ("free", "free"): 2 * math.pi,
+    ("free", "pinned"): 4.493,  # tan k = k
+    ("guided", "pinned"): math.pi / 2,
+}
+#: Of others, and of a rectangular section.
+SHEARED_ELSE, SHEAR = math.pi, 5 / 6
 #: What linear elements of a box add to its stiffness, (a + b r^2)/n^2 with full and reduced integration, fitted to
 #: cantilevers ten times as long as thick, n 1 to 8, r 1/2 to 4, poisson 0 to .4999: nearly all that bend 1.1 to 30
 #: times as stiffly are met within a factor of two (poisson to .495, else within 2.3).
@@ -54,7 +67,7 @@ class Span(NamedTuple):
 
     length: float
     ends: tuple[str, str]
-    axis: int = -1
+    axis: int
 
     @property
     def slowness(self) -> float:
@@ -95,24 +108,31 @@ class _Line:
         # as bodies of files are no boxes quite
         self.length = float(min(np.ptp(self.s), form.lengths[axis] * 1.1))
         self.near = _SAME_PLACE * self.length
+        # of a large box only some of its nodes are here, farther apart than its elements are long
+        apart = np.ptp(self.s) / max(int((np.diff(np.sort(self.s)) > self.near).sum()), 1)
+        self.spacing = max(float(apart), float(form.spacing[axis]))
 
     def spans(self) -> list[Span]:
-        """Return what bends along it; nothing if an end slides without turning, as a plane of symmetry holds it."""
+        """Return what bends along it."""
         first, last = float(self.s.min()), float(self.s.max())
         at = np.sort(self.s[self.sideways])
-        if any(self._keeps_angle(end) and not (self.sideways & self._here(end)).any() for end in (first, last)):
-            return []
         if not len(at):
-            return [Span(self.length, ("free", "free"), self.axis)]
+            one, other = sorted((self._loose_kind(first), self._loose_kind(last)))
+            return [Span(self.length, (one, other), self.axis)]
         at = at[np.concatenate(([True], np.diff(at) > self.near))]
-        ends = [*([(first, "free")] if at[0] - first > self.near else [])]
+        ends = [(first, self._loose_kind(first))] if at[0] - first > self.near else []
         ends += [(float(place), self._kind(place, at)) for place in at]
-        ends += [(last, "free")] if last - at[-1] > self.near else []
+        ends += [(last, self._loose_kind(last))] if last - at[-1] > self.near else []
         return [
             Span(float(b - a), (min(one, other), max(one, other)), self.axis)
             for (a, one), (b, other) in zip(ends[:-1], ends[1:], strict=True)
-            if b - a >= SLENDER * self.form.thickness and ((self.s > a + self.near) & (self.s < b - self.near)).any()
+            if b - a >= SLENDER * self.form.thickness and self._moves(a, one, b, other)
         ]
+
+    def _moves(self, a: float, one: str, b: float, other: str) -> bool:
+        """Return whether a node of a stretch can move sideways: an end that is not held, or one within."""
+        within = (self.s > a + self.near) & (self.s < b - self.near)
+        return bool({"free", "guided"} & {one, other}) or bool(within.any())
 
     def _here(self, place: float) -> np.ndarray:
         return np.abs(self.s - place) <= self.near
@@ -127,8 +147,13 @@ class _Line:
     def _kind(self, place: float, at: np.ndarray) -> str:
         """Return how an end is held at one of the places where something is held sideways."""
         # what is held all along cannot turn
-        all_along = not self.angled and (np.abs(at - place) < self.form.thickness).sum() > 1
+        alike = max(self.form.thickness, 1.5 * self.spacing)
+        all_along = not self.angled and (np.abs(at - place) < alike).sum() > 1
         return "clamped" if self._keeps_angle(place) or all_along else "pinned"
+
+    def _loose_kind(self, place: float) -> str:
+        """Return how an end is held at which nothing is held sideways."""
+        return "guided" if self._keeps_angle(place) else "free"
 
 
 def bending_period(solid: Solid, form: Form, span: Span) -> float:
@@ -139,8 +164,8 @@ def bending_period(solid: Solid, form: Form, span: Span) -> float:
     square = inverse**2
     if solid.shape.beam is None or solid.shape.beam.theory == "timoshenko":
         shear = solid.young / (2 * (1 + solid.poisson))
-        quarter = math.pi / 2 if span.ends == ("clamped", "free") else math.pi
-        square += (span.length / quarter) ** 2 * solid.density / (SHEAR * shear)
+        k = SHEARED.get(span.ends, SHEARED_ELSE)
+        square += (span.length / k) ** 2 * solid.density / (SHEAR * shear)
     return 2 * math.pi * math.sqrt(square)
 
 

@@ -110,7 +110,7 @@ def _box(box: Box, cavity: Box | None) -> Form:
 
 
 class _Wall(NamedTuple):
-    """A wall of a hollow box: its thickness, the longest side of what it bounds, m, and its elements."""
+    """A wall of a hollow box: its thickness, the side of what it bounds over which it bends, m, and its elements."""
 
     thickness: float
     length: float
@@ -132,7 +132,9 @@ def _walls(spacing: np.ndarray, cells: np.ndarray, left_out: list[np.ndarray]) -
     walls = []
     for axis, out in enumerate(left_out):
         others = [n for n in range(len(spacing)) if n != axis]
-        along = max(others, key=lambda n: sides[n])
+        # a panel bends over its shorter side between walls that hold it: round a tube, not along it
+        between = [n for n in others if left_out[n][0] > 0 or left_out[n][-1] < cells[n] - 1]
+        along = min(between or others, key=lambda n: sides[n])
         for n in (int(out[0]), int(cells[axis] - 1 - out[-1])):
             if n:
                 bend = Bend(float(n), float(spacing[along] / spacing[axis]))
