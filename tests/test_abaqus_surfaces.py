@@ -187,12 +187,13 @@ def test_shells_in_the_plane_have_edges(tmp_path):
         ("NAME=S", "it names no elements"),
         ("NAME=S, TYPE=CUTTING SURFACE\n1, 2, 3", "TYPE=CUTTING SURFACE"),
         ("NAME=S, COMBINE=UNION\nA, B", "COMBINE"),
+        ("NAME=skin\n2, S6", "a set of other elements has its name"),
     ],
 )
 def test_a_surface_that_is_not_read_whole_is_told_and_is_no_place(tmp_path, surface, why):
     path = tmp_path / "m.inp"
     path.write_text(f"{BAR}*SURFACE, {surface}\n")
-    name = "end" if "end" in surface else "S"
+    name = next((name for name in ("end", "skin") if f"={name}" in surface), "S")
     assert f"mesh: surface {name} is not read: {why}" in notes_of(path, 3)
     if name == "S":
         with pytest.raises(InputError) as error:
@@ -200,7 +201,8 @@ def test_a_surface_that_is_not_read_whole_is_told_and_is_no_place(tmp_path, surf
         assert f"where.tag = 'S': could not be read from the mesh file: {why}; it has " in str(error.value)
         assert ", S" not in str(error.value).split("it has")[-1]
     else:
-        assert len(read_tags(solid(path, "end"), 3, "solids.b", Path())["end"].nodes) == 3
+        tag = read_tags(solid(path, name), 3, "solids.b", Path())[name]
+        assert len(tag.nodes) == {"end": 3, "skin": 4}[name]
 
 
 def test_facets_that_several_surfaces_or_shells_share_are_there_once(tmp_path):
@@ -210,3 +212,35 @@ def test_facets_that_several_surfaces_or_shells_share_are_there_once(tmp_path):
     points, facets = read_cells(Shape(mesh=str(path)), 3, 2, "mesh", Path(), [])
     assert size(points[facets]) == pytest.approx(10.0)
     assert len(np.unique(np.sort(facets, axis=1), axis=0)) == len(facets) == 20
+
+
+@pytest.mark.parametrize(
+    "surface, told",
+    [
+        ("NAME=end\n1, S6", "end is a surface and a set of other nodes: as a place it is the surface"),
+        ("NAME=one\n1, S6", "one is a surface and a set of other elements: as a place it is the surface"),
+        ("NAME=nall\n1, S1\n1, S2\n2, S1\n2, S2", None),
+        ("NAME=skin\n1, S6", None),
+    ],
+)
+def test_a_surface_that_takes_the_name_of_another_place_is_told(tmp_path, surface, told):
+    path = tmp_path / "m.inp"
+    path.write_text(f"{BAR}*SURFACE, {surface}\n")
+    assert [note for note in notes_of(path, 3) if "surface" in note] == ([f"mesh: {told}"] if told else [])
+
+
+def test_names_of_surfaces_have_no_case(tmp_path):
+    """Cards of one name are one surface, as the first spells it, and are read all or none."""
+    path = tmp_path / "m.inp"
+    path.write_text(f"{BAR}*SURFACE, NAME=Low\n1, S1\n*SURFACE, NAME=LOW\n2, S1\n")
+    assert size(places(path, "Low", 3)[1]) == pytest.approx(2.0)
+    assert "LOW" not in read_tags(solid(path, "Low"), 3, "solids.b", Path())
+    path.write_text(f"{BAR}*SURFACE, NAME=Low\n1, S1\n*SURFACE, NAME=LOW\n2, S7\n")
+    assert "mesh: surface Low is not read: S7 is no side of C3D8R" in notes_of(path, 3)
+    assert read_tags(solid(path, "Low"), 3, "solids.b", Path())["Low"].unread
+
+
+def test_a_set_of_a_surface_s_nodes_with_their_middles_is_no_other_place(tmp_path):
+    corners, cell = [(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)], "*ELEMENT, TYPE=CPS6\n1, 1, 2, 3, 4, 5, 6"
+    path = written(tmp_path / "m.inp", corners, cell, "*NSET, NSET=S\n1, 2, 4\n*SURFACE, NAME=S\n1, S1")
+    assert not [note for note in notes_of(path, 2) if "surface" in note]

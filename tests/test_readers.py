@@ -201,8 +201,10 @@ def test_abaqus_with_all_that_it_allows(tmp_path):
         ("*ELEMENT, TYPE=CPS3\n1, 2, 3", "CPS3 do not have 3 nodes each"),
         ("*ELEMENT, TYPE=CPS3\n1, 2, 3, 99", "nodes that the file does not hold"),
         ("*INCLUDE, INPUT=none.txt", "it needs none.txt, which is not beside it"),
-        ("*INCLUDE, INPUT=m.inp", "at most 5 files deep"),
+        ("*INCLUDE, INPUT=m.inp", "it includes itself"),
         ("*INCLUDE, INPUT=.", "beside the file"),
+        ("*INCLUDE, INPUT=..", r"\*INCLUDE of \.\.: it must be a file, beside the file"),
+        ("*NODE, INPUT=n.txt", r"put \*INCLUDE, INPUT=n.txt in the line after it"),
         ("*INCLUDE, INPUT=../m.inp", "beside the file"),
     ],
 )

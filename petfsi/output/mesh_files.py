@@ -20,7 +20,6 @@ from petfsi.scene.tables import Shape
 DIRECTORY = "meshes"
 #: Of a format in two files, the endings that belong together.
 _PAIRS = ({".node", ".ele"},)
-_INCLUDED = re.compile(r"^\*INCLUDE\s*,\s*INPUT\s*=\s*\"?(?:\./)*([^\s,\"/\\]+)", re.IGNORECASE | re.MULTILINE)
 _HDF5_ITEM = re.compile(r"([^\s<>:/\\]+\.(?:h5|hdf5|bin))\s*:?")
 
 
@@ -127,11 +126,13 @@ def _with_companions(path: Path) -> list[Path]:
 
 def _included(path: Path) -> set[Path]:
     """Return the files that one of Abaqus's includes, and those that these do."""
+    from petfsi.geometry.readers.abaqus_cards import included_names, read_text
+
     found: set[Path] = set()
     rest = [path]
     while rest:
-        text = rest.pop().read_text(errors="replace")
-        new = {path.parent / name for name in _INCLUDED.findall(text)} - found
+        names = included_names(read_text(rest.pop()))
+        new = {path.parent / name for name in names if Path(name).name == name} - found
         found |= new
         rest += [other for other in new if other.is_file()]
     return found

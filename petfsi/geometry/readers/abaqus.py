@@ -5,7 +5,6 @@ meshio knows some types of elements, and takes no blank fields, no sets that are
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 
+from petfsi.geometry.readers.abaqus_cards import read_cards
 from petfsi.geometry.readers.abaqus_surfaces import Block, Surface, add_surfaces
 
 _FLAT = {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}
@@ -36,10 +36,6 @@ _NODES = {
 }  # fmt: skip
 #: Cards that make or move nodes and elements.
 _MAKERS = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETRIC MODEL GENERATION")
-#: How deep files include others.
-DEPTH = 5
-
-Card = tuple[str, dict[str, str], list[str]]
 
 
 class _Sets:
@@ -73,7 +69,9 @@ def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
     node_sets, element_sets = _Sets(), _Sets()
     others: dict[str, int] = {}
     instances = 0
-    for word, given, lines in _cards(path, 0):
+    for word, given, lines in read_cards(path):
+        if word in ("NODE", "ELEMENT") and "INPUT" in given:
+            raise meshio.ReadError(f"*{word} with INPUT: put *INCLUDE, INPUT={given['INPUT']} in the line after it")
         if word == "NODE":
             if given.get("SYSTEM", "R").upper() != "R":
                 raise meshio.ReadError("nodes in coordinates that are not rectangular (*NODE, SYSTEM)")
@@ -101,8 +99,8 @@ def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
             if instances > 1 or any(line.strip(", ") for line in lines):
                 raise meshio.ReadError("parts that are moved or there more than once (*INSTANCE): flatten the model")
     notes += [f"{count:,} lines of elements of type {name} are not read" for name, count in others.items()]
-    if not points:
-        raise meshio.ReadError("no *NODE")
+    if not any(len(numbers) for numbers, _ in points):
+        raise meshio.ReadError("no nodes (*NODE)")
     sets = {"NSET": node_sets.all(), "ELSET": element_sets.all()}
     mesh, tags = _joined(points, cells, sets["NSET"], sets["ELSET"])
     add_surfaces(mesh, cells, tags, surfaces, sets, notes)
@@ -128,26 +126,6 @@ def _joined(
             for name, chosen in element_sets.items()}  # fmt: skip
     of = {name: np.flatnonzero(np.isin(tags, chosen)) for name, chosen in node_sets.items()}
     return meshio.Mesh(where, blocks, cell_sets=sets, point_sets=of), tags
-
-
-def _cards(path: Path, depth: int) -> Iterator[Card]:
-    """Yield the cards of a file and of those that it includes: word, what is given with it, lines of data."""
-    lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and line[:2] != "**"]
-    starts = [n for n, line in enumerate(lines) if line.lstrip()[:1] == "*"]
-    for begin, end in itertools.pairwise([*starts, len(lines)]):
-        head = lines[begin].strip()
-        while head.endswith(",") and begin + 1 < end:
-            begin += 1
-            head += lines[begin].strip()
-        word, *words = (part.strip() for part in head[1:].split(","))
-        given = {key.strip().upper(): value.strip().strip('"') for key, _, value in (w.partition("=") for w in words)}
-        if word.upper() != "INCLUDE":
-            yield " ".join(word.upper().split()), given, lines[begin + 1 : end]
-            continue
-        name = str(Path(given.get("INPUT", "")))  # without ./
-        if depth == DEPTH or Path(name).name != name:
-            raise meshio.ReadError(f"*INCLUDE of {name}: at most {DEPTH} files deep, and beside the file")
-        yield from _cards(path.with_name(name), depth + 1)
 
 
 def _kind(name: str) -> tuple[str | None, str]:

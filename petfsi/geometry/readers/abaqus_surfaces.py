@@ -60,6 +60,11 @@ class Surface(NamedTuple):
     given: Mapping[str, str]
     lines: list[str]
 
+    @property
+    def type(self) -> str:
+        """TYPE, in capitals."""
+        return self.given.get("TYPE", "ELEMENT").upper()
+
 
 class _Unread(Exception):
     """Why a surface cannot be read."""
@@ -83,6 +88,9 @@ def add_surfaces(
 ) -> None:
     """Give a mesh the facets and nodes of surfaces as groups; those that cannot be read whole are told.
 
+    Names have no case, and cards of one name and type are one surface. One that takes the name of a set of other nodes
+    or elements is told, too: as a place, facets go before them.
+
     Parameters
     ----------
     mesh : meshio.Mesh
@@ -98,17 +106,19 @@ def add_surfaces(
     unread: dict[str, list[str]] = {}
     facets = _Facets()
     upper = {kind: {name.upper(): numbers for name, numbers in of.items()} for kind, of in sets.items()}
-    for name, given, lines in surfaces:
+    for surface in _joined(surfaces):
+        name, given, lines = surface
         try:
             if not name:
                 raise _Unread("it has no name")
-            kind = given.get("TYPE", "ELEMENT").upper()
-            if "COMBINE" in given or kind not in ("ELEMENT", "NODE"):
-                raise _Unread("COMBINE" if "COMBINE" in given else f"TYPE={kind}")
-            if kind == "NODE":
+            if "COMBINE" in given or surface.type not in ("ELEMENT", "NODE"):
+                raise _Unread("COMBINE" if "COMBINE" in given else f"TYPE={surface.type}")
+            if surface.type == "NODE":
                 _add_nodes(mesh, name, tags, _members(lines, upper["NSET"], "nodes", tags)[""])
             else:
-                _find(facets, name, mesh, blocks, _of_elements(lines, upper["ELSET"], blocks))
+                hidden = _find(facets, name, mesh, blocks, _of_elements(lines, upper["ELSET"], blocks))
+                notes += [f"{shown(name, 100)} is a surface and a set of other {what}: as a place it is the surface"
+                          for what in hidden]  # fmt: skip
         except _Unread as reason:
             unread.setdefault(str(reason), []).append(name or "?")
     _add_elements(mesh, facets.elements)
@@ -117,6 +127,21 @@ def add_surfaces(
     mesh.info = {"unread": {name: why for why, names in unread.items() for name in names}}
     for why, names in unread.items():
         notes.append(f"surface {shown(', '.join(names), 100)} is not read: {why}")
+
+
+def _joined(surfaces: list[Surface]) -> list[Surface]:
+    """Return surfaces, those of one name and type as one, as their first card spells it; of nodes before others.
+
+    So facets find the nodes whose name they take.
+    """
+    names: dict[str, str] = {}
+    found: dict[tuple[str, str, bool], Surface] = {}
+    for surface in surfaces:
+        key = surface.name.upper()
+        name = names.setdefault(key, surface.name)
+        first = found.setdefault((key, surface.type, "COMBINE" in surface.given), Surface(name, surface.given, []))
+        first.lines.extend(surface.lines)
+    return sorted(found.values(), key=lambda surface: surface.type != "NODE")
 
 
 # ---- what lines name ----------------------------------------------------------------------------------------
@@ -158,8 +183,8 @@ def _numbers(word: str, sets: Mapping[str, np.ndarray], what: str) -> np.ndarray
 
 def _find(
     facets: _Facets, name: str, mesh: meshio.Mesh, blocks: list[Block], members: Mapping[str, np.ndarray]
-) -> None:
-    """Find the facets of a surface, all of them or none."""
+) -> list[str]:
+    """Find the facets of a surface, all of them or none; return what they hide: nodes, elements."""
     elements: list[tuple[str, int, np.ndarray]] = []
     sides: list[tuple[str, np.ndarray]] = []
     for side, numbers in members.items():
@@ -180,8 +205,43 @@ def _find(
             else:
                 raise _Unread(f"{shown(side, 20)} is no side of {block.type}")
         sides += [(name, part) for part in (_free(mesh, free) if free else ())]
+    hidden = _hidden(mesh, name, [part for _, part in sides] + [_corners(mesh, n, rows) for _, n, rows in elements])
     facets.elements += elements
     facets.sides += sides
+    return hidden
+
+
+def _hidden(mesh: meshio.Mesh, name: str, parts: list[np.ndarray]) -> list[str]:
+    """Return of what there is a set that has a surface's name and lies elsewhere; the surface hides it as a place.
+
+    Raises
+    ------
+    _Unread
+        When that set is of facets: as groups of the mesh the two would be one.
+    """
+    hidden = []
+    own = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(part.ravel() for part in parts)]))
+    nodes = mesh.point_sets.get(name, own)
+    if not np.array_equal(nodes, own):
+        corner = np.zeros(len(mesh.points), dtype=bool)
+        for n in range(len(mesh.cells)):
+            corner[_corners(mesh, n)] = True
+        # sets may hold nodes in the middles of sides, too
+        if not np.array_equal(nodes[corner[nodes]], own):
+            hidden.append("nodes")
+    chosen = [(n, rows) for n, rows in enumerate(mesh.cell_sets.get(name, [])) if len(rows)]
+    others = [_corners(mesh, n, rows).ravel() for n, rows in chosen]
+    if others and not np.array_equal(np.unique(np.concatenate(others)), own):
+        width = max((part.shape[1] for part in parts), default=0)
+        if any(KINDS[mesh.cells[n].type].dim == (1 if width == 2 else 2) for n, _ in chosen):
+            raise _Unread("a set of other elements has its name")
+        hidden.append("elements")
+    return hidden
+
+
+def _corners(mesh: meshio.Mesh, n: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Return the corners of elements of a block."""
+    return mesh.cells[n].data[rows, : KINDS[mesh.cells[n].type].corners]
 
 
 def _free(mesh: meshio.Mesh, chosen: Mapping[int, np.ndarray]) -> Iterator[np.ndarray]:
