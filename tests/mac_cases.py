@@ -67,6 +67,17 @@ def step(fluid, time, dt):
     fluid.accept(solve(fluid), time, dt)
 
 
+def crossings(fluid):
+    """Return how many cells the flow crosses in a second, the most along any axis."""
+    fastest = fluid.velocity if fluid.sheets is None else fluid.sheets.fastest(fluid.velocity)
+    most = max(np.abs(v).max() / h for v, h in zip(fastest, fluid.grid.dx, strict=True))
+    return fluid.comm.allreduce(float(most), op=MPI.MAX)
+
+
+def kinetic_energy(fluid):
+    return fluid.comm.allreduce(fluid.stock().kinetic)
+
+
 def whole(comm, slab):
     """Return a global array from its pieces, on every rank."""
     pieces = comm.allgather(slab)

@@ -8,7 +8,7 @@ import pytest
 
 from petfsi.errors import InputError
 from petfsi.geometry.mesh_cells import read_cells
-from petfsi.geometry.meshes import build_mesh
+from petfsi.geometry.meshes import build_mesh, read_surface
 from petfsi.geometry.places import located, located_facets, read_tags, with_middles
 from petfsi.geometry.quadratic import with_middles as quadratic
 from petfsi.geometry.surfaces import boundary_facets
@@ -181,6 +181,9 @@ def test_shells_in_the_plane_have_edges(tmp_path):
         ("NAME=S\n4, S1", "it names 1 elements that are not read or not there"),
         ("NAME=S\n1, S1\n99, S1", "it names 1 elements that are not read or not there"),
         ("NAME=S\nthree, S1", "no set of elements THREE is read"),
+        ("NAME=S\n1, S1\n, S2", "a line names no elements"),
+        ("NAME=S\n1, S1\n*SURFACE, NAME=S\n99, S1", "it names 1 elements that are not read or not there"),
+        ("NAME=S\nskin\n*SURFACE, NAME=S, TYPE=NODE\n13", "it names 1 nodes that are not read or not there"),
         ("NAME=S, TYPE=NODE\none", "no set of nodes ONE is read"),
         ("NAME=S, TYPE=NODE\n13", "it names 1 nodes that are not read or not there"),
         ("NAME=end, TYPE=NODE\n1", "a set of other nodes has its name"),
@@ -208,8 +211,8 @@ def test_a_surface_that_is_not_read_whole_is_told_and_is_no_place(tmp_path, surf
 def test_facets_that_several_surfaces_or_shells_share_are_there_once(tmp_path):
     """Else the skin would be no surface of an obstacle: a closed one has each facet once."""
     path = tmp_path / "m.inp"
-    path.write_text(f"{BAR}*SURFACE, NAME=S\none\n*SURFACE, NAME=T\n1, S6\n*SURFACE, NAME=U\ntwo,\n")
-    points, facets = read_cells(Shape(mesh=str(path)), 3, 2, "mesh", Path(), [])
+    path.write_text(f"{BAR}*SURFACE, NAME=S\none\nboth\n*SURFACE, NAME=T\n1, S6\n*SURFACE, NAME=S\nskin,\n")
+    points, facets = read_cells(Shape(mesh=str(path), cells="S"), 3, 2, "mesh", Path(), [])
     assert size(points[facets]) == pytest.approx(10.0)
     assert len(np.unique(np.sort(facets, axis=1), axis=0)) == len(facets) == 20
 
@@ -244,3 +247,42 @@ def test_a_set_of_a_surface_s_nodes_with_their_middles_is_no_other_place(tmp_pat
     corners, cell = [(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)], "*ELEMENT, TYPE=CPS6\n1, 1, 2, 3, 4, 5, 6"
     path = written(tmp_path / "m.inp", corners, cell, "*NSET, NSET=S\n1, 2, 4\n*SURFACE, NAME=S\n1, S1")
     assert not [note for note in notes_of(path, 2) if "surface" in note]
+
+
+#: The rest of the skin of BAR.
+SKIN = """*ELEMENT, TYPE=S4R, ELSET=skin
+12, 3, 6, 12, 9
+13, 1, 4, 5, 2
+14, 2, 5, 6, 3
+15, 7, 8, 11, 10
+16, 8, 9, 12, 11
+17, 1, 2, 8, 7
+18, 2, 3, 9, 8
+19, 4, 10, 11, 5
+20, 5, 11, 12, 6
+"""
+
+
+def test_a_surface_within_a_skin_of_shells_is_no_part_of_an_obstacle(tmp_path):
+    path, notes = tmp_path / "m.inp", []
+    path.write_text(f"{BAR}{SKIN}*SURFACE, NAME=contact\n1, S4\n")
+    _, facets = read_surface(Shape(mesh=str(path)), 3, "obstacles.o.shape", Path(), notes)
+    assert len(facets) == 20
+    assert notes[-1] == (
+        "obstacles.o.shape.mesh: all cells are taken, of whatever group, but no surfaces made of other cells' sides; "
+        "cells = ... would take one of the groups contact, skin"
+    )
+
+
+def test_surfaces_that_close_nothing_together_are_named(tmp_path):
+    """Without elements that are facets, all that surfaces name is taken: one of them may be what is meant."""
+    path = tmp_path / "m.inp"
+    solids = BAR.replace("*ELEMENT, TYPE=S4R, ELSET=skin\n3, 1, 7, 10, 4\n", "")
+    path.write_text(f"{solids}*SURFACE, NAME=hull\nboth\n*SURFACE, NAME=contact\n1, S4\n")
+    with pytest.raises(InputError) as error:
+        read_surface(Shape(mesh=str(path)), 3, "obstacles.o.shape", Path())
+    assert str(error.value).endswith(
+        "the surface must be closed (all cells are taken, of whatever group; cells = ... would take one of the groups "
+        "contact, hull)"
+    )
+    assert len(read_surface(Shape(mesh=str(path), cells="hull"), 3, "obstacles.o.shape", Path())[1]) == 20

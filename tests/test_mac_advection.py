@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mac_cases import PERIODIC, make_fluid, set_velocity, whole, whole_state
+from mac_cases import PERIODIC, crossings, make_fluid, set_velocity, whole, whole_state
 from mpi4py import MPI
 
 from petfsi.fields.mac.carrying import advect, advection
@@ -143,7 +143,7 @@ def test_large_steps_across_ranks_equal_those_on_one(dim, courant):
             initial={"velocity": velocity},
             obstacles={"post": {"shape": {"ball": {"centre": [0.7, 0.5, 0.4][:dim], "radius": 0.2}}}},
         )
-        dt = courant / fluid.cfl(1.0)
+        dt = courant / crossings(fluid)
         fluid.predict(0.0, dt)
         fluid.accept(fluid.unknown(), 0.0, dt)  # no pressure: the advected velocity itself
         fluid.predict(dt, 0.5 * dt)
@@ -225,7 +225,7 @@ def test_what_is_too_fast_for_one_sweep_goes_as_if_all_went_in_several(dim, shee
             initial={"velocity": [f"0.2+{jet}", f"0.4*sin(2*pi*x)*{jet}", "0.3*cos(4*x)*y"][:dim]},
             obstacles={"wall": {"shape": wall}} if sheet else {},
         )
-        dt = 8.0 / fluid.cfl(1.0)
+        dt = 8.0 / crossings(fluid)
         fluid.predict(0.0, dt)
         seen.append([m.copy() for m in left])
         left.clear()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mac_cases import PERIODIC, make_fluid, set_velocity, solid_box, step, whole, whole_state
+from mac_cases import PERIODIC, crossings, make_fluid, set_velocity, solid_box, step, whole, whole_state
 from mpi4py import MPI
 
 SECOND = ["bdf2", "midpoint"]
@@ -124,7 +124,7 @@ def test_ranks_agree_also_where_sweeps_are_many(integrator, dim):
             cells, comm, sides=sides, initial={"velocity": velocity}, obstacles=post, integrator=integrator,
             smoke={"initial": "x"},
         )  # fmt: skip
-        t, dt = 0.0, 5.0 / fluid.cfl(1.0)
+        t, dt = 0.0, 5.0 / crossings(fluid)
         for h in (dt, 0.7 * dt, 0.9 * dt):
             fluid.predict(t, h)
             fluid.assemble(t, h)

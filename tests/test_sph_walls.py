@@ -378,13 +378,21 @@ def test_a_box_that_is_larger_than_the_fluids_is_told():
     found = liquid(room, DX, [block([0.0, 0.0], [0.2, 1.0]), block([0.5, 0.0], [0.53, 1.25])], {}, HERE)
     assert found.notes == [
         "fluid.fill: 4 places lie outside the box",
-        "fluid.fill.1 has x from 0.5 to 1.03 m, the fluid's box from 0 to 1 m: what lies in that is filled",
-        "fluid.fill.1 is 1.25 m long along y, which repeats after 1 m: that is filled once",
+        "fluid.fill.1 has x from 0.5 to 1.03 m, the fluid's box from 0 to 1 m: what lies in that is filled; "
+        "is 1.25 m long along y, which repeats after 1 m: that is filled once",
     ]
     assert found.volume.sum() == pytest.approx(0.7)
     found = liquid(room, DX, [block([-0.001, 0.1 * n], [0.2, 0.1]) for n in range(10)], {}, HERE)
-    assert len(found.notes) == 7 and found.notes[-1] == "fluid.fill: 4 more boxes reach beyond the fluid's"
+    assert len(found.notes) == 7 and found.notes[-1] == "fluid.fill: of 4 more boxes only a part is filled"
     assert liquid(room, DX, [block([0.0, 0.7], [1.0, 1.0])], {}, HERE).notes == []
+
+
+def test_boxes_beyond_the_fluids_are_counted_not_their_axes():
+    corner = [block([-0.5 - 0.1 * n] * 2, [0.6 + 0.1 * n] * 2) for n in range(7)]
+    told = [note for note in liquid(domain(10, 10), DX, corner, {}, HERE).notes if "places" not in note]
+    assert [note.split()[0] for note in told] == [*(f"fluid.fill.{n}" for n in range(6)), "fluid.fill:"]
+    assert told[0].count("what lies in that is filled") == 2
+    assert told[-1] == "fluid.fill: of 1 more box only a part is filled"
 
 
 def test_what_is_outside_is_dropped_and_counted():

@@ -72,7 +72,8 @@ def read_cells(
         held = "; ".join([held or "no cells at all", *(shown(note, 300) for note in said)])
         raise InputError(f"{where}: holds no {SIMPLEX[of]} cells, which dim = {dim} wants; found {held}")
     if shape.cells is None:
-        notes += _groups_told(mesh, of, key)
+        advice = groups_advised(mesh, of)
+        notes += [f"{key}: {advice}"] * bool(advice)
     if unused.any() and shape.cells is None:
         notes.append(f"{key}: {np.count_nonzero(unused):,} points that belong to no cell are left out")
     points = _as_dim(points, dim, where) * shape.scale + np.array(shape.translate or [0.0] * dim)
@@ -85,35 +86,47 @@ def read_cells(
 def body_blocks(mesh: meshio.Mesh, shape: Shape, of: int, key: str) -> Iterator[tuple[int, Kind, np.ndarray]]:
     """Return number, kind and nodes of the blocks of cells that a shape means: those of dimension ``of``, in its group.
 
+    Without a group these are the file's elements; sides that it names beside them only if there are none.
+
     Raises
     ------
     InputError
         If there is no such group.
     """
-    chosen = None
+    parts: dict[int, slice | np.ndarray] = {n: slice(None) for n in _without_added(mesh, of)[0]}
     if shape.cells is not None:
         groups = cell_groups(mesh, of)
         if shape.cells not in groups:
             known = shown(", ".join(sorted(groups)), 300) or "none at all"
             where = f"{key.removesuffix('mesh')}cells = {shape.cells!r}"
             raise InputError(f"{where}: the mesh file has no such group of cells; it has {known}")
-        chosen = groups[shape.cells]
-    for n, block in enumerate(mesh.cells):
-        kind = KINDS.get(block.type)
-        if kind is not None and kind.dim == of:
-            nodes = np.asarray(block.data, dtype=np.int64)
-            nodes = nodes if chosen is None else nodes[chosen[n]]
-            if len(nodes):
-                yield n, kind, nodes
+        parts = {n: chosen for n, chosen in enumerate(groups[shape.cells]) if len(chosen)}
+    for n, part in parts.items():
+        yield n, KINDS[mesh.cells[n].type], np.asarray(mesh.cells[n].data, dtype=np.int64)[part]
 
 
-def _groups_told(mesh: meshio.Mesh, of: int, key: str) -> Iterator[str]:
-    """Say which groups of cells there are, where all cells are taken and these are not all in one."""
-    count = sum(len(block.data) for block in mesh.cells if block.type in KINDS and KINDS[block.type].dim == of)
+def groups_advised(mesh: meshio.Mesh, of: int) -> str:
+    """Return what to say of groups where all cells are taken and these are not all in each; else nothing."""
+    taken, added = _without_added(mesh, of)
+    count = sum(len(mesh.cells[n].data) for n in taken)
     groups = cell_groups(mesh, of)
-    if any(sum(map(len, chosen)) < count for chosen in groups.values()):
-        names = shown(", ".join(sorted(groups)), 300)
-        yield f"{key}: all cells are taken, of whatever group; cells = ... would take one of the groups {names}"
+    if all(sum(len(chosen[n]) for n in taken) == count for chosen in groups.values()):
+        return ""
+    names = shown(", ".join(sorted(groups)), 300)
+    but = ", but no surfaces made of other cells' sides" if added else ""
+    return f"all cells are taken, of whatever group{but}; cells = ... would take one of the groups {names}"
+
+
+def _without_added(mesh: meshio.Mesh, of: int) -> tuple[list[int], bool]:
+    """Return the blocks of elements of a dimension, and whether there are others, of sides that surfaces name.
+
+    A surface for a contact or a load is no part of what encloses a body: one with a skin of its own is that skin.
+    Where there are no elements, all that surfaces name is taken.
+    """
+    every = [n for n, block in enumerate(mesh.cells)
+             if len(block.data) and block.type in KINDS and KINDS[block.type].dim == of]  # fmt: skip
+    own = [n for n in every if n not in (mesh.info or {}).get("added", ())]
+    return own or every, 0 < len(own) < len(every)
 
 
 def _others(mesh: meshio.Mesh, of: int) -> dict[str, int]:

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from petfsi.errors import InputError
 from petfsi.geometry.balls import ball_mesh
 from petfsi.geometry.beams import strip_mesh
-from petfsi.geometry.mesh_cells import read_cells
-from petfsi.geometry.mesh_files import once
+from petfsi.geometry.mesh_cells import groups_advised, read_cells
+from petfsi.geometry.mesh_files import once, open_mesh
 from petfsi.geometry.shapes import inside
 from petfsi.geometry.surfaces import boundary_facets, occurrences, ridges, signed_volumes
 from petfsi.scene.solids import Solid
@@ -228,7 +228,11 @@ def _read_closed(shape: Shape, dim: int, key: str, directory: Path) -> tuple[np.
     _refuse(where, np.count_nonzero(occurrences(facets) > 1), "duplicate facets")
     rim = ridges(facets).reshape(-1, dim - 1)
     open_ridges = _distinct(rim, occurrences(rim) != 2)
-    _refuse(where, open_ridges, "edges that do not lie between exactly two facets: the surface must be closed")
+    advice = ""
+    if open_ridges and shape.cells is None:
+        advice = groups_advised(open_mesh(shape, key, directory).mesh, dim - 1)
+    closed = "the surface must be closed" + f" ({advice})" * bool(advice)
+    _refuse(where, open_ridges, f"edges that do not lie between exactly two facets: {closed}")
     # between two facets that agree, an edge is run through once each way (in 2D: a point is end and start once)
     ends = rim if dim == 3 else facets[:, :1]
     _, count = np.unique(ends, axis=0, return_counts=True)

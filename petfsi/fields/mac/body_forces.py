@@ -90,7 +90,7 @@ class BodyForces:
             star.parts = star.parts + pushed
         for axis, (v, kind) in enumerate(zip(star, face_kind, strict=True)):
             dv = duration * gravity[axis]
-            part = tuple((s.start, s.stop) for s in self.grid.owned(axis))
+            part = self.grid.owned_ranges(axis)
             plain = dv if weight is None or self.grid.periodic[axis] else 0.0
             lifted = v if smoke is None else smoke  # without smoke nothing is lifted, and this not read
             pressure.add_forces(v, given[axis], kind, kinds.STEP[axis], plain, lifted, -buoyancy * dv, part)
@@ -100,7 +100,10 @@ class BodyForces:
         self, density: float, velocity: Faces, further: np.ndarray, face_kind: list[np.ndarray],
         openness: list[np.ndarray], extras: Extras | None, sheets: Sheets | None,
     ) -> float:  # fmt: skip
-        """Return this rank's share of the power of the last step's forces at a velocity, W. Not collective."""
+        """Return this rank's share of the power of the last step's forces at a velocity, W.
+
+        Collective, without a reduction: smoke at divided faces is gathered from all ranks.
+        """
         forces = self.last
         if forces is None:
             return 0.0

@@ -67,7 +67,7 @@ def stock(
     mass = density * grid.cell_volume
     momentum, squares = np.zeros(grid.dim), 0.0
     for a, v in enumerate(velocity):
-        first, second = _moments(kind[a], openness[a], v, _part(grid, a))
+        first, second = _moments(kind[a], openness[a], v, grid.owned_ranges(a))
         momentum[a] = mass * first
         squares += second
     if extras is not None:
@@ -85,9 +85,9 @@ def power(
     total = 0.0
     for a, v in enumerate(velocity):
         if forces.plain[a] != 0.0:
-            total += forces.plain[a] * _moments(kind[a], openness[a], v, _part(grid, a))[0]
+            total += forces.plain[a] * _moments(kind[a], openness[a], v, grid.owned_ranges(a))[0]
         if forces.smoke is not None and forces.lift[a] != 0.0:
-            total += forces.lift[a] * _carried(kind[a], openness[a], v, forces.smoke, STEP[a], _part(grid, a))
+            total += forces.lift[a] * _carried(kind[a], openness[a], v, forces.smoke, STEP[a], grid.owned_ranges(a))
     if extras is not None:
         total += float((_shares(extras) * velocity.parts[extras.row]) @ forces.on_links(extras.axis, extras.row))
     return density * grid.cell_volume * total
@@ -190,10 +190,6 @@ def _shares(extras: Extras) -> np.ndarray:
     """Return the part of a whole cell's mass that each link of this rank's own faces has; zero for others."""
     share = np.where((extras.below < 0) | (extras.above < 0), 0.5, 1.0) * extras.openness
     return np.where(extras.owned, share, 0.0)
-
-
-def _part(grid: MacGrid, axis: int) -> tuple[tuple[int, int], ...]:
-    return tuple((s.start, s.stop) for s in grid.owned(axis))
 
 
 @njit(cache=True)

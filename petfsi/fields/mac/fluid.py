@@ -364,15 +364,6 @@ class MacFluid(CoveredGrid):
         """What a user should know of the sides."""
         return self._notes
 
-    def cfl(self, dt: float) -> float:
-        """Return the largest number of cells that the flow crosses in dt along an axis. Collective."""
-        most = max(advect.largest(v) * dt / h for v, h in zip(self.velocity, self.grid.dx, strict=True))
-        parts = self.velocity.parts
-        if len(parts):
-            assert self.sheets is not None
-            most = max(most, advect.largest(parts * dt / self.grid.dx[self.sheets.table.axis]))
-        return self.comm.allreduce(most, op=MPI.MAX)
-
     def stock(self) -> Stock:
         """Return this rank's share of momentum and kinetic energy of the faces that the pressure acts on.
 
@@ -389,7 +380,10 @@ class MacFluid(CoveredGrid):
         return Stock(stock.momentum + pushed @ self.slivers.normal, stock.kinetic + kinetic)
 
     def power(self) -> Work:
-        """Return this rank's share of the power of gravity and of what comes through sides, see ``budget``."""
+        """Return this rank's share of the power of gravity and of what comes through sides, see ``budget``.
+
+        Collective, without a reduction.
+        """
         velocity, faces = self._transport.solved(self.velocity), (self.face_kind, self.openness)
         gravity = self._body_forces.power(self.density, velocity, self.smoke_parts, *faces, self.extras, self.sheets)
         into = budget.inflow(
@@ -409,14 +403,6 @@ class MacFluid(CoveredGrid):
         array = self.grid.zeros_cells()
         self.grid.read_slab(read, name, array, None)
         return self.grid.to_vec(array)
-
-    def kinetic_energy(self) -> float:
-        """Return the kinetic energy of the fluid cells, J (in 2D per metre of thickness). Collective."""
-        part = self._part(None)
-        total = sum(
-            pressure.sum_of_squares(self.cell_kind, self.velocity[axis], kinds.STEP[axis], part) for axis in self._axes
-        )
-        return 0.5 * self.density * self.grid.cell_volume * self.comm.allreduce(total)
 
     def is_finite(self) -> bool:
         """Return whether this rank's velocity and pressure are finite. Not collective."""

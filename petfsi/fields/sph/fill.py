@@ -54,7 +54,7 @@ class Fill:
     clearance : float
         How far particles keep off them, m.
     cut : list of str
-        What of boxes lies beyond the domain, or longer than a period, box after box.
+        A line for each box that reaches beyond the domain, or is longer than a period: what of it is filled.
     """
 
     x: Array
@@ -70,14 +70,17 @@ class Fill:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know of particles that were dropped."""
+        """What a user should know of particles that were dropped, and of boxes of which only a part is filled."""
         told = {
             "lie outside the box": self.outside,
             "lie in obstacles or solids, or less than half a spacing before them": self.blocked,
             "lie in more than one shape, and count once": self.double,
         }
-        more = [f"fluid.fill: {len(self.cut) - TOLD} more boxes reach beyond the fluid's"][: len(self.cut) > TOLD]
-        return [*(f"fluid.fill: {n} places {what}" for what, n in told.items() if n), *self.cut[:TOLD], *more]
+        said = [f"fluid.fill: {n} places {what}" for what, n in told.items() if n] + self.cut[:TOLD]
+        more = len(self.cut) - TOLD
+        if more > 0:
+            said.append(f"fluid.fill: of {more} more box{'es' * (more > 1)} only a part is filled")
+        return said
 
     def is_solid(self, points: Array) -> Array:
         """Return at which points (n, dim) no particle may be: behind walls, in obstacles or too near to them."""
@@ -136,12 +139,13 @@ def liquid(
         found.append((x, volume, np.full(len(x), number)))
     x, volume, which = (np.concatenate(part) for part in zip(*found, strict=True))
     outside, blocked, double = dropped.tolist()
-    cut = [line for number, shape in enumerate(shapes) for line in _cut(shape, domain, f"fluid.fill.{number}")]
+    parts = {f"fluid.fill.{number}": "; ".join(_cut(shape, domain)) for number, shape in enumerate(shapes)}
+    cut = [f"{key} {said}" for key, said in parts.items() if said]
     return Fill(x, volume, which, outside, blocked, double, domain, solids, clearance * dx, cut)
 
 
-def _cut(shape: Shape, domain: Domain, key: str) -> Iterator[str]:
-    """Say what is filled of a box that reaches beyond the domain, or is longer than a period, along each axis."""
+def _cut(shape: Shape, domain: Domain) -> Iterator[str]:
+    """Say what is filled of a box along each axis on which it reaches beyond the domain or is longer than a period."""
     if shape.box is None:
         return
     for a, (begin, size) in enumerate(zip(shape.box.origin, shape.box.size, strict=True)):
@@ -150,10 +154,10 @@ def _cut(shape: Shape, domain: Domain, key: str) -> Iterator[str]:
         if domain.periodic[a]:
             if size > high - low + slack:
                 repeats = f"which repeats after {high - low:g} m"
-                yield f"{key} is {size:g} m long along {axis}, {repeats}: that is filled once"
+                yield f"is {size:g} m long along {axis}, {repeats}: that is filled once"
         elif begin < low - slack or begin + size > high + slack:
             reach = f"{axis} from {begin:g} to {begin + size:g} m"
-            yield f"{key} has {reach}, the fluid's box from {low:g} to {high:g} m: what lies in that is filled"
+            yield f"has {reach}, the fluid's box from {low:g} to {high:g} m: what lies in that is filled"
 
 
 def _filled(

@@ -6,7 +6,8 @@ Analysis User's Guide*, "Element-based surface definition" and, for the numbers 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import functools
+from collections.abc import Collection, Iterator, Mapping
 from typing import NamedTuple
 
 import meshio
@@ -70,12 +71,19 @@ class _Unread(Exception):
     """Why a surface cannot be read."""
 
 
-class _Facets:
-    """Facets by the surfaces that they are of: whole elements by block and row, others by their corners."""
+class _Found:
+    """Places by the surfaces that they are of: whole elements by block and row, sides by their corners, nodes."""
 
     def __init__(self) -> None:
         self.elements: list[tuple[str, int, np.ndarray]] = []
         self.sides: list[tuple[str, np.ndarray]] = []
+        self.nodes: list[tuple[str, np.ndarray]] = []
+
+    def drop(self, names: Collection[str]) -> None:
+        """Forget what is of surfaces of these names."""
+        self.elements = [part for part in self.elements if part[0] not in names]
+        self.sides = [part for part in self.sides if part[0] not in names]
+        self.nodes = [part for part in self.nodes if part[0] not in names]
 
 
 def add_surfaces(
@@ -94,7 +102,8 @@ def add_surfaces(
     Parameters
     ----------
     mesh : meshio.Mesh
-        Its cells are those of the blocks. Its ``info["unread"]`` says by name why a surface is not read.
+        Its cells are those of the blocks. Its ``info["unread"]`` says by name why a surface is not read, and
+        ``info["added"]`` which blocks hold sides of elements, instead of elements.
     blocks : list of Block
     tags : ndarray of int, shape (n_points,)
         Numbers of the nodes, ascending.
@@ -104,7 +113,7 @@ def add_surfaces(
     notes : list of str
     """
     unread: dict[str, list[str]] = {}
-    facets = _Facets()
+    found, bare = _Found(), _Bare(mesh)
     upper = {kind: {name.upper(): numbers for name, numbers in of.items()} for kind, of in sets.items()}
     for surface in _joined(surfaces):
         name, given, lines = surface
@@ -114,19 +123,23 @@ def add_surfaces(
             if "COMBINE" in given or surface.type not in ("ELEMENT", "NODE"):
                 raise _Unread("COMBINE" if "COMBINE" in given else f"TYPE={surface.type}")
             if surface.type == "NODE":
-                _add_nodes(mesh, name, tags, _members(lines, upper["NSET"], "nodes", tags)[""])
+                _find_nodes(found, name, mesh, tags, _members(lines, upper["NSET"], "nodes", tags)[""])
             else:
-                hidden = _find(facets, name, mesh, blocks, _of_elements(lines, upper["ELSET"], blocks))
+                members = _of_elements(lines, upper["ELSET"], blocks)
+                hidden = _find_facets(found, name, mesh, blocks, bare, members)
                 notes += [f"{shown(name, 100)} is a surface and a set of other {what}: as a place it is the surface"
                           for what in hidden]  # fmt: skip
         except _Unread as reason:
             unread.setdefault(str(reason), []).append(name or "?")
-    _add_elements(mesh, facets.elements)
+    why = {name: what for what, names in unread.items() for name in names}
+    found.drop(why)  # a name may have several cards, and some of them be read
+    mesh.point_sets.update(found.nodes)
+    _add_elements(mesh, found.elements)
     for corners in _FACETS:
-        _add_sides(mesh, corners, [(name, part) for name, part in facets.sides if part.shape[1] == corners])
-    mesh.info = {"unread": {name: why for why, names in unread.items() for name in names}}
-    for why, names in unread.items():
-        notes.append(f"surface {shown(', '.join(names), 100)} is not read: {why}")
+        _add_sides(mesh, corners, [(name, part) for name, part in found.sides if part.shape[1] == corners])
+    mesh.info = {"unread": why, "added": range(len(blocks), len(mesh.cells))}
+    for what, names in unread.items():
+        notes.append(f"surface {shown(', '.join(dict.fromkeys(names)), 100)} is not read: {what}")
 
 
 def _joined(surfaces: list[Surface]) -> list[Surface]:
@@ -157,8 +170,9 @@ def _members(lines: list[str], sets: Mapping[str, np.ndarray], what: str, known:
     found: dict[str, list[np.ndarray]] = {}
     for line in lines:
         first, side, *_ = (field.strip().strip('"').upper() for field in f"{line},,".split(","))
-        if first:
-            found.setdefault(side if what == "elements" else "", []).append(_numbers(first, sets, what))
+        if not first:
+            raise _Unread(f"a line names no {what}")
+        found.setdefault(side if what == "elements" else "", []).append(_numbers(first, sets, what))
     numbers = {side: np.unique(np.concatenate(parts)) for side, parts in found.items()}
     if not any(map(len, numbers.values())):
         raise _Unread(f"it names no {what}")
@@ -178,17 +192,16 @@ def _numbers(word: str, sets: Mapping[str, np.ndarray], what: str) -> np.ndarray
     raise _Unread(f"no set of {what} {shown(word, 50)} is read")
 
 
-# ---- their facets -------------------------------------------------------------------------------------------
+# ---- their facets and nodes ---------------------------------------------------------------------------------
 
 
-def _find(
-    facets: _Facets, name: str, mesh: meshio.Mesh, blocks: list[Block], members: Mapping[str, np.ndarray]
+def _find_facets(
+    found: _Found, name: str, mesh: meshio.Mesh, blocks: list[Block], bare: _Bare, members: Mapping[str, np.ndarray]
 ) -> list[str]:
     """Find the facets of a surface, all of them or none; return what they hide: nodes, elements."""
     elements: list[tuple[str, int, np.ndarray]] = []
     sides: list[tuple[str, np.ndarray]] = []
     for side, numbers in members.items():
-        free: dict[int, np.ndarray] = {}
         for n, block in enumerate(blocks):
             rows = np.flatnonzero(np.isin(block.numbers, numbers))
             if not len(rows):
@@ -197,21 +210,22 @@ def _find(
             corners = _SIDES.get((kind.dim, kind.corners), ())
             solid = block.letter == "S"
             if side == "" and solid:
-                free[n] = rows
+                sides += [(name, part) for part in bare.sides(n, rows)]
             elif side in (*_WHOLE, "") and not solid:
                 elements.append((name, n, rows))
             elif side[:1] == block.letter != "" and side[1:].isdigit() and 1 <= int(side[1:]) <= len(corners):
                 sides.append((name, nodes[rows][:, corners[int(side[1:]) - 1]]))
             else:
                 raise _Unread(f"{shown(side, 20)} is no side of {block.type}")
-        sides += [(name, part) for part in (_free(mesh, free) if free else ())]
-    hidden = _hidden(mesh, name, [part for _, part in sides] + [_corners(mesh, n, rows) for _, n, rows in elements])
-    facets.elements += elements
-    facets.sides += sides
+    hidden = _hidden(
+        found, mesh, name, [part for _, part in sides] + [_corners(mesh, n, rows) for _, n, rows in elements]
+    )
+    found.elements += elements
+    found.sides += sides
     return hidden
 
 
-def _hidden(mesh: meshio.Mesh, name: str, parts: list[np.ndarray]) -> list[str]:
+def _hidden(found: _Found, mesh: meshio.Mesh, name: str, parts: list[np.ndarray]) -> list[str]:
     """Return of what there is a set that has a surface's name and lies elsewhere; the surface hides it as a place.
 
     Raises
@@ -221,7 +235,7 @@ def _hidden(mesh: meshio.Mesh, name: str, parts: list[np.ndarray]) -> list[str]:
     """
     hidden = []
     own = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(part.ravel() for part in parts)]))
-    nodes = mesh.point_sets.get(name, own)
+    nodes = dict(found.nodes).get(name, mesh.point_sets.get(name, own))
     if not np.array_equal(nodes, own):
         corner = np.zeros(len(mesh.points), dtype=bool)
         for n in range(len(mesh.cells)):
@@ -244,32 +258,45 @@ def _corners(mesh: meshio.Mesh, n: int, rows: np.ndarray | slice = slice(None)) 
     return mesh.cells[n].data[rows, : KINDS[mesh.cells[n].type].corners]
 
 
-def _free(mesh: meshio.Mesh, chosen: Mapping[int, np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield the sides of some elements, given by block and row, that are no other element's, too."""
-    own: dict[tuple[int, int], list[np.ndarray]] = {}
-    every: dict[tuple[int, int], list[np.ndarray]] = {}
-    for n, block in enumerate(mesh.cells):
-        dim, corners = KINDS[block.type][:2]
-        for side in _SIDES.get((dim, corners), ()):
-            every.setdefault((dim, len(side)), []).append(np.sort(block.data[:, side], axis=1))
-            if n in chosen:
-                own.setdefault((dim, len(side)), []).append(block.data[chosen[n]][:, side])
-    for width, parts in own.items():
-        sides = np.concatenate(parts)
-        both = np.concatenate((np.sort(sides, axis=1), *every[width]))
-        _, which, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
-        # each is found twice, once as its own
-        yield sides[count[which.ravel()[: len(sides)]] == 2]
+def _find_nodes(found: _Found, name: str, mesh: meshio.Mesh, tags: np.ndarray, numbers: np.ndarray) -> None:
+    nodes = np.searchsorted(tags, numbers)
+    known = [mesh.point_sets[name]] if name in mesh.point_sets else [other for of, other in found.nodes if of == name]
+    if any(not np.array_equal(nodes, other) for other in known):
+        raise _Unread("a set of other nodes has its name")
+    found.nodes.append((name, nodes))
+
+
+class _Bare:
+    """The sides of a mesh's elements that are no other element's, too: found when first asked for, for all at once."""
+
+    def __init__(self, mesh: meshio.Mesh) -> None:
+        self._mesh = mesh
+
+    def sides(self, n: int, rows: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the corners of those sides of some elements, given by block and row."""
+        nodes = self._mesh.cells[n].data[rows]
+        for (of, side), bare in self._found.items():
+            if of == n:
+                yield nodes[bare[rows]][:, side]
+
+    @functools.cached_property
+    def _found(self) -> dict[tuple[int, tuple[int, ...]], np.ndarray]:
+        """By block and corners of a side, of which of the block's elements it is bare."""
+        alike: dict[tuple[int, int], list[tuple[int, tuple[int, ...]]]] = {}
+        for n, block in enumerate(self._mesh.cells):
+            dim, corners = KINDS[block.type][:2]
+            for side in _SIDES.get((dim, corners), ()):
+                alike.setdefault((dim, len(side)), []).append((n, side))
+        found: dict[tuple[int, tuple[int, ...]], np.ndarray] = {}
+        for keys in alike.values():
+            parts = [np.sort(self._mesh.cells[n].data[:, side], axis=1) for n, side in keys]
+            _, which, count = np.unique(np.concatenate(parts), axis=0, return_inverse=True, return_counts=True)
+            ends = np.cumsum([len(part) for part in parts])
+            found |= dict(zip(keys, np.split(count[which.ravel()] == 1, ends[:-1]), strict=True))
+        return found
 
 
 # ---- groups of the mesh -------------------------------------------------------------------------------------
-
-
-def _add_nodes(mesh: meshio.Mesh, name: str, tags: np.ndarray, numbers: np.ndarray) -> None:
-    nodes = np.searchsorted(tags, numbers)
-    if name in mesh.point_sets and not np.array_equal(mesh.point_sets[name], nodes):
-        raise _Unread("a set of other nodes has its name")
-    mesh.point_sets[name] = nodes
 
 
 def _add_elements(mesh: meshio.Mesh, elements: list[tuple[str, int, np.ndarray]]) -> None:

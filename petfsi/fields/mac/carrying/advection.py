@@ -170,8 +170,8 @@ class Advection:
         bounded = axis is None
         ends = self._ends if axis is None else self._face_ends[axis]
         advect.sweep(
-            q, out, moved, *three(path.velocity), _offset(axis), self._part(axis), sweep.courant, sweep.long,
-            *ends, beyond, self.cubic, bounded, sweep.limit, left,
+            q, out, moved, *three(path.velocity), _offset(axis), self.grid.owned_ranges(axis), sweep.courant,
+            sweep.long, *ends, beyond, self.cubic, bounded, sweep.limit, left,
         )  # fmt: skip
 
     def _rest(
@@ -213,8 +213,8 @@ class Advection:
         there = where if axis is None else faces_below(where, axis)
         ends = self._ends if axis is None else self._face_ends[axis]
         advect.mark_read(
-            read, there, boxed, *three(path.velocity), _offset(axis), self._part(axis), sweep.courant, *ends,
-            beyond, STENCIL[self.interpolation],
+            read, there, boxed, *three(path.velocity), _offset(axis), self.grid.owned_ranges(axis), sweep.courant,
+            *ends, beyond, STENCIL[self.interpolation],
         )  # fmt: skip
         return self._complete(read)
 
@@ -224,13 +224,10 @@ class Advection:
         self.grid.fill_sides(cells, None)
         return cells
 
-    def _part(self, axis: int | None) -> tuple[tuple[int, int], ...]:
-        return tuple((s.start, s.stop) for s in self.grid.owned(axis))
-
     def keep_own(self, own: np.ndarray, read: np.ndarray, path: Path, axis: int, out: np.ndarray) -> None:
         """Add to faces carried from ``read`` what they have beyond it, as far as it has not flowed on."""
         courant = (*(path.span / self.grid.dx), 0.0)[:3]
-        advect.keep_own(out, own, read, *three(path.velocity), _offset(axis), self._part(axis), courant)
+        advect.keep_own(out, own, read, *three(path.velocity), _offset(axis), self.grid.owned_ranges(axis), courant)
 
 
 def _offset(axis: int | None) -> tuple[float, ...]:

@@ -137,6 +137,10 @@ class MacGrid:
             parts.append(slice(self.ghost[b], self.ghost[b] + self.owned_shape[b] + last))
         return tuple(parts)  # type: ignore[return-value]
 
+    def owned_ranges(self, axis: int | None) -> tuple[tuple[int, int], ...]:
+        """Return what ``owned`` does as begin and end along each axis, which kernels take."""
+        return tuple((part.start, part.stop) for part in self.owned(axis))
+
     def inside(self, axis: int | None) -> tuple[slice, slice, slice]:
         """Return the part of a local array, ghosts included, that lies in the domain."""
         return tuple(self.halo.inside(b, axis) for b in range(3))  # type: ignore[return-value]

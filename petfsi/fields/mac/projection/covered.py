@@ -312,7 +312,7 @@ class CoveredGrid(PressureFluid):
         c = factor / self.density * grid.cell_volume / grid.dx**2
         values = np.zeros(len(pattern.indices))
         arrays = (*three(self.face_kind), *three(self.open_sides.conducting(self.openness)))
-        pressure.laplacian(self._active, *arrays, self._part(None), pattern.slot, c, values)
+        pressure.laplacian(self._active, *arrays, self.grid.owned_ranges(None), pattern.slot, c, values)
         rows = pattern.indptr, pattern.indices, values
         if self.extras is not None:
             rows = self.extras.block(pattern, values, self.layout, self.index, grid, c, self.open_sides.link_yields)
@@ -353,7 +353,3 @@ class CoveredGrid(PressureFluid):
         column = np.arange(n + 1), np.zeros(n, dtype=np.int64), np.ones(n)
         i, _, values = outer_products(*self.flux_rows, *column, slivers.slot[use], weight)
         return gather_sums(self.comm, self.layout, i, values)
-
-    def _part(self, axis: int | None) -> tuple[tuple[int, int], ...]:
-        """Return the owned ranges of faces of ``axis`` (cells: None)."""
-        return tuple((s.start, s.stop) for s in self.grid.owned(axis))

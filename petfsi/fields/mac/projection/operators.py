@@ -70,7 +70,7 @@ class Operators:
         for axis, v in enumerate(velocity):
             pressure.known_inflow_of(
                 cells, v, self.given[axis], self.face_kind[axis], self.openness[axis], kinds.STEP[axis], areas[axis],
-                _part(self.grid, None), through,
+                self.grid.owned_ranges(None), through,
             )  # fmt: skip
         inflow[cells] = through
         if self.extras is not None:
@@ -97,7 +97,7 @@ class Operators:
         solved = Faces(np.zeros_like(v) for v in star)
         for axis, v in enumerate(star):
             pressure.project(
-                v, p, self.given[axis], self.face_kind[axis], kinds.STEP[axis], c[axis], _part(grid, axis),
+                v, p, self.given[axis], self.face_kind[axis], kinds.STEP[axis], c[axis], grid.owned_ranges(axis),
                 solved[axis],
             )  # fmt: skip
         if self.open_sides.total:
@@ -112,7 +112,3 @@ class Operators:
             solved.parts = local.gathered(parts, extras.row[extras.owned])
             local.mean_into(solved, solved.parts)
         return solved
-
-
-def _part(grid: MacGrid, axis: int | None) -> tuple[tuple[int, int], ...]:
-    return tuple((s.start, s.stop) for s in grid.owned(axis))

@@ -225,17 +225,3 @@ def add_forces(star, bound, kind, step, dv, smoke, dv_smoke, part):
                     if dv_smoke != 0.0:
                         mean = 0.5 * (smoke[i, j, k] + smoke[i - di, j - dj, k - dk])
                         star[i, j, k] += dv_smoke * mean
-
-
-@njit(cache=True)
-def sum_of_squares(cell_kind, v, step, part):
-    """Return half the sum of v^2 of the two faces of each fluid cell along one axis, m^2/s^2."""
-    (b0, e0), (b1, e1), (b2, e2) = part
-    di, dj, dk = step
-    total = 0.0
-    for i in range(b0, e0):
-        for j in range(b1, e1):
-            for k in range(b2, e2):
-                if cell_kind[i, j, k] == FLUID:
-                    total += 0.5 * (v[i, j, k] ** 2 + v[i + di, j + dj, k + dk] ** 2)
-    return total

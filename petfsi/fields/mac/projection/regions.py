@@ -86,8 +86,7 @@ def find_regions(
     """Return the closed regions among the active cells and the extra unknowns. Collective."""
     comm = grid.comm
     labels = np.full(grid.shape(None), -1, dtype=np.int64)
-    own = grid.owned(None)
-    part = tuple((s.start, s.stop) for s in own)
+    own, part = grid.owned(None), grid.owned_ranges(None)
     kind_x, kind_y, kind_z = three(face_kind)
     first = _label(active, kind_x, kind_y, kind_z, part, grid.dim == 2, labels)
     place = np.unravel_index(first, grid.owned_shape)
