@@ -122,19 +122,6 @@ def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
     )
 
 
-def read_selection(text: str, axes: Mapping[str, list[str]]) -> dict[str, list[str]]:
-    """Return by axis the points that ``--only 'axis=point,...'`` names; several of an axis are alternatives."""
-    found: dict[str, list[str]] = {}
-    for part in text.split(","):
-        axis, separator, point = (word.strip() for word in part.partition("="))
-        if not separator or axis not in axes:
-            raise InputError(f"--only {shown(part)}: must be axis=point; axes are {', '.join(axes) or 'none'}")
-        if not any(same_point(one, point) for one in axes[axis]):
-            raise InputError(f"--only {shown(part)}: no such point; {axis} has {shown(', '.join(axes[axis]), 500)}")
-        found.setdefault(axis, []).append(point)
-    return found
-
-
 # ---- axes ---------------------------------------------------------------------------------------------------
 
 
