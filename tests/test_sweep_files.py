@@ -7,10 +7,20 @@ import pytest
 from blocks import falling_block
 
 from petfsi.errors import InputError
+from petfsi.scene.load import apply_set, scene_from_dict
+from petfsi.scene.raw import parsed
 from petfsi.sweeps.plan import plan_sweep
 from petfsi.sweeps.selection import select
 from petfsi.sweeps.states import Look
 from petfsi.sweeps.table import row_of
+
+FLUID = """
+[fluid]
+kind = "{kind}"
+density = 1000.0
+origin = [0.0, 0.0]
+size = [1.0, 2.0]
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -199,3 +209,33 @@ def test_a_figure_does_not_take_the_place_of_an_axis():
     """).runs[0]
     row = row_of(run, Look("done", "", 2, summary={"probes": {"top.y": 0.5}}))
     assert (row["axis.last.top.y"], row["last.top.y"], row["axis.state"], row["dt"]) == ("1", 0.5, "2", "0.1")
+
+
+# ---- what a scene's mistakes suggest ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "setting, shape, meant",
+    [
+        ("solids.block.cells=3", "box", "'solids.block.shape.box.cells'"),
+        ("solids.block.cells=3", "ball", "'solids.block.shape.ball.cells'"),
+        ("solids.block.cells=3", "mesh", "'solids.block.shape.cells'"),
+        ("solids.block.scale=3", "mesh", "'solids.block.shape.scale'"),
+        ("coupling.spacing=3", "mac", ""),
+        ("coupling.spacing=3", "sph", "'fluid.spacing'"),
+        ("coupling.cells=3", "sph", ""),
+    ],
+)
+def test_what_a_setting_is_taken_for_is_of_the_scene(setting, shape, meant):
+    shapes = {
+        "ball": "{ ball = { centre = [0.0, 0.0], radius = 1.0, cells = 4 } }",
+        "mesh": '{ mesh = "block.msh" }',
+    }
+    fluid = FLUID.format(kind=shape) if shape in ("mac", "sph") else ""
+    given = {"shape": shapes[shape]} if shape in shapes else {}
+    data = parsed(falling_block(0.2, 0.05, **given, more=fluid), "scene")
+    apply_set(data, setting)
+    with pytest.raises(InputError) as caught:
+        scene_from_dict(data)
+    line = next(line for line in str(caught.value).splitlines() if setting.split("=")[0] in line)
+    assert (f"did you mean {meant}?" in line) if meant else ("did you mean" not in line)
