@@ -235,7 +235,7 @@ def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoRet
 @click.argument("target", metavar="SWEEP.toml|DIR", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the sweep; runs/<its file's name> by default.")
 @click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Ranks at a time; by default one per core.")
-@click.option("--only", default="", metavar="AXIS=POINT,...", help="Take these points alone, e.g. solver=paper.")
+@click.option("--only", default="", metavar="AXIS=POINT,...", help="Take these points, or runs of these names, alone.")
 @click.option(
     "--retry",
     type=click.Choice(["failed", "lost", "refused", "changed"]),

@@ -56,7 +56,7 @@ def sweep(place, here, monkeypatch):
 
 def written(*names, text="", repeat=1):
     """Write a sweep of one axis with points of these names, which the stub understands."""
-    points = "".join(f"{name} = {{}}\n" for name in names)
+    points = "".join(f'{name} = {{ set = {{ title = "{name}" }} }}\n' for name in names)
     Path("s.toml").write_text(f'scene = "scene.toml"\nrepeat = {repeat}\n{text}\n[axis.how]\n{points}')
     return "s.toml"
 
@@ -195,7 +195,7 @@ def test_a_folder_needs_nothing_outside_itself(place):
     Path("far/block.ele").write_text("cells")
     body = 'shape = { mesh = "far/block.node" }'
     Path("scene.toml").write_text(re.sub("shape = .*", body, SCENE))
-    written("a", "b")
+    written("a", repeat=2)
     SweepFolder(Path("out")).make(plan_sweep(Path("s.toml")))
     for path in ("far/block.node", "far/block.ele", "scene.toml", "s.toml"):
         Path(path).unlink()

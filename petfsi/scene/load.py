@@ -119,7 +119,7 @@ def _validate(data: dict[str, Any], directory: Path, source: str) -> Scene:
         scene: Scene | None = Scene.model_validate(data, context=context)
         problems: list[Problem] = []
     except ValidationError as error:
-        problems = [mistakes.describe(entry) for entry in error.errors(include_url=False)]
+        problems = [mistakes.describe(entry, data) for entry in error.errors(include_url=False)]
         scene = mistakes.mend(data, error, context)
     wrong = [problem.key for problem in problems]
     if scene is not None:

@@ -6,14 +6,17 @@ import copy
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from petfsi.messages import shown
+from petfsi.scene.fluids import DEFAULT
 from petfsi.scene.keys import NAME, NUMBER, Key, every_key, is_form, is_model, kind_of, settings, walk
 from petfsi.scene.schema import Scene
+from petfsi.scene.tables import Shape
 
 #: No value stands at the key.
 ABSENT = object()
@@ -33,6 +36,10 @@ ALIKE = 0.75
 MEANT = 2
 #: What only a solid's shape can be or have.
 OF_SOLIDS = ("beam", "cavity")
+#: What of a shape is said of a mesh file alone.
+OF_MESHES = ("cells", "scale", "translate")
+#: What is known of a scene where there is none.
+NO_SCENE: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -78,14 +85,14 @@ def shorten(value: Any) -> str:
 # ---- from pydantic ------------------------------------------------------------------------------------------
 
 
-def describe(entry: Mapping[str, Any]) -> Problem:
-    """Return pydantic's finding as a problem."""
+def describe(entry: Mapping[str, Any], data: Mapping[str, Any]) -> Problem:
+    """Return pydantic's finding in the tables of a scene as a problem."""
     loc = [part for part in entry["loc"] if not str(part).startswith("[")]
     key = ".".join(str(part) for part in loc if not is_form(part))
     field = _field(loc)
     value = ABSENT if entry["type"] == "missing" or entry["loc"][-1] == "[key]" else entry["input"]
     if entry["type"] == "extra_forbidden":
-        return Problem(key, value, unknown(loc))
+        return Problem(key, value, unknown(loc, data))
     allowed = _allowed(entry)
     unit = f" ({field.description})" if field is not None and field.description else ""
     return Problem(key, value, allowed + unit)
@@ -120,13 +127,15 @@ def _allowed(entry: Mapping[str, Any]) -> str:
     return entry["msg"]
 
 
-def unknown(loc: list[Any]) -> str:
+def unknown(loc: list[Any], data: Mapping[str, Any] = NO_SCENE) -> str:
     """Say that there is no such setting, and which one may be meant: beside it, or else in another table.
 
     Parameters
     ----------
     loc : list of str or int
         The path of the setting, with pydantic's forms of tables or without; that of its table is sound.
+    data : mapping
+        The scene's tables, as far as it has any.
     """
     name, table = str(loc[-1]), _model(loc[:-1])
     given = shown(name)
@@ -136,7 +145,7 @@ def unknown(loc: list[Any]) -> str:
     having = [kind_of(kind) for kind in kinds if name in settings(kind)]
     if having:
         return f"belongs to kind = {' and '.join(having)}; known here are {', '.join(fields)}"
-    inside = [names for names in _elsewhere(loc, name) if names[: len(path) - 1] == _words(path[:-1])]
+    inside = [names for names in _elsewhere(loc, name, data) if names[: len(path) - 1] == _words(path[:-1])]
     near = difflib.get_close_matches(name, fields, 1)
     if near and not inside:
         unit = fields[near[0]].description
@@ -147,13 +156,13 @@ def unknown(loc: list[Any]) -> str:
     if (name,) in everywhere:
         return f"no setting '{given}' here; it stands at the top of the scene, before any [table]"
     alike = difflib.get_close_matches(name, dict.fromkeys(everywhere.values()), 1, ALIKE)
-    meant = _elsewhere(loc, alike[0]) if alike else []
+    meant = _elsewhere(loc, alike[0], data) if alike else []
     if meant:
         return f"no setting '{given}' here; did you mean {' or '.join(repr('.'.join(names)) for names in meant)}?"
     return f"no setting '{given}'; known here are {', '.join(fields)}"
 
 
-def _elsewhere(loc: list[Any], name: str) -> list[tuple[str, ...]]:
+def _elsewhere(loc: list[Any], name: str, data: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return where else a setting may be meant to stand that is called so: at one place or two, or at none.
 
     Parameters
@@ -161,17 +170,22 @@ def _elsewhere(loc: list[Any], name: str) -> list[tuple[str, ...]]:
     loc : list of str or int
         Where it stands instead.
     name : str
+    data : mapping
+        The scene's tables: of several places those in tables that it has come first.
     """
     at = _words(part for part in loc[:-1] if not is_form(part))
-    kinds = {key.kind for key in every_key()} & {str(part).strip("<>") for part in loc if is_form(part)}
+    fluid = _table_at(("fluid",), data)
+    given = set() if fluid is None else {str(fluid.get("kind", DEFAULT))}
+    kinds = {key.kind for key in every_key()} & ({str(part).strip("<>") for part in loc if is_form(part)} | given)
     keys = [key for key in every_key() if key.path[-1] == name and len(key.path) > 1
             and not (kinds and key.kind and key.kind not in kinds) and not _only_of_solids(key)]  # fmt: skip
-    paths = {_as_given(key.path, at): key for key in keys}
+    paths = {path: key for key in keys if not _of_no_mesh(path := _as_given(key.path, at), key, data)}
     common = {path: _common(path, at) for path in paths}
     nearest = [path for path in paths if common[path] == max(common.values())]
     below = any(common[path] == len(at) for path in nearest) and at != ()
     if not below and len(paths) > MEANT and any(key.tables for key in keys):
         return []  # a table that may stand in many others is not meant for the one that happens to be near
+    nearest = [path for path in nearest if _table_at(path[:-1], data) is not None] or nearest
     found = [path for path in nearest if len(path) == min(map(len, nearest))]
     return found if len(found) <= MEANT else []
 
@@ -183,6 +197,23 @@ def _words(parts: Iterable[Any]) -> tuple[str, ...]:
 def _only_of_solids(key: Key) -> bool:
     """Whether a key is of a shape that solids alone may be, and stands where none can."""
     return not set(key.path).isdisjoint(OF_SOLIDS) and key.path[:3] != ("solids", NAME, "shape")
+
+
+def _of_no_mesh(path: tuple[str, ...], key: Key, data: Mapping[str, Any]) -> bool:
+    """Whether a key is of mesh files, and would stand in a shape that is none."""
+    shape = _table_at(path[:-1], data)
+    return key.owner is Shape and path[-1] in OF_MESHES and shape is not None and "mesh" not in shape
+
+
+def _table_at(path: tuple[str, ...], data: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the table that a scene has at a path, None if it has none."""
+    here: Any = data
+    for part in path:
+        if isinstance(here, list) and part.isdigit() and int(part) < len(here):
+            here = here[int(part)]
+        else:
+            here = here.get(part) if isinstance(here, Mapping) else None
+    return here if isinstance(here, Mapping) else None
 
 
 def _common(path: tuple[str, ...], at: tuple[str, ...]) -> int:

@@ -15,11 +15,10 @@ from petfsi.messages import shown
 from petfsi.output import files
 from petfsi.sweeps import attempts
 from petfsi.sweeps.claim import claim, give_back
-from petfsi.sweeps.file import read_selection
-from petfsi.sweeps.folder import SweepFolder, axes_of, describe_changed
-from petfsi.sweeps.names import same_point
+from petfsi.sweeps.folder import SweepFolder, describe_changed
 from petfsi.sweeps.plan import Plan, Planned, plan_sweep
 from petfsi.sweeps.pool import Pool
+from petfsi.sweeps.selection import select
 from petfsi.sweeps.states import RESULTS, STATES, look_at
 from petfsi.sweeps.table import collect
 
@@ -42,7 +41,7 @@ class Wanted:
     jobs : int or None
         Ranks at a time; by default as many as there are cores for this process.
     only : str
-        ``axis=point,...``; empty for all.
+        ``axis=point,...``, or names of runs; empty for all.
     retry : str or None
         One of ``RETRY``.
     dry_run, status, collect : bool
@@ -168,17 +167,7 @@ def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, say: Call
 
 def _chosen(wanted: Wanted, runs: Sequence[Planned]) -> list[Planned]:
     """Return the runs that ``--only`` names."""
-    if not wanted.only:
-        return list(runs)
-    rules = read_selection(wanted.only, axes_of(runs))
-    found = [
-        run
-        for run in runs
-        if all(any(same_point(run.axes[axis], one) for one in points) for axis, points in rules.items())
-    ]
-    if not found:
-        raise InputError(f"--only {shown(wanted.only, 200)}: no run is at these points; they are excluded")
-    return found
+    return select(wanted.only, runs) if wanted.only else list(runs)
 
 
 def _check_launcher(runs: Sequence[Planned]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from petfsi.messages import shown
 from petfsi.scene.dump import as_toml
 from petfsi.scene.raw import read_raw
 from petfsi.sweeps.names import point_text, same_point
-from petfsi.sweeps.values import read_values
+from petfsi.sweeps.values import is_dated, read_values
 
 KEYS = ("scene", "set", "repeat", "steps", "axis", "exclude")
 #: Words of an axis whose points are values, and of a point that has a name.
@@ -122,19 +122,6 @@ def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
     )
 
 
-def read_selection(text: str, axes: Mapping[str, list[str]]) -> dict[str, list[str]]:
-    """Return by axis the points that ``--only 'axis=point,...'`` names; several of an axis are alternatives."""
-    found: dict[str, list[str]] = {}
-    for part in text.split(","):
-        axis, separator, point = (word.strip() for word in part.partition("="))
-        if not separator or axis not in axes:
-            raise InputError(f"--only {shown(part)}: must be axis=point; axes are {', '.join(axes) or 'none'}")
-        if not any(same_point(one, point) for one in axes[axis]):
-            raise InputError(f"--only {shown(part)}: no such point; {axis} has {shown(', '.join(axes[axis]), 500)}")
-        found.setdefault(axis, []).append(point)
-    return found
-
-
 # ---- axes ---------------------------------------------------------------------------------------------------
 
 
@@ -143,7 +130,6 @@ def _axes(given: Any, mistakes: list[str]) -> dict[str, list[Point]]:
         mistakes.append("axis: must be a table of axes")
         return {}
     found: dict[str, list[Point]] = {}
-    by: dict[str, str] = {}
     for name, axis in given.items():
         key = f"axis.{shown(name)}"
         if not _AXIS.fullmatch(name) or len(name) > 60:
@@ -153,10 +139,34 @@ def _axes(given: Any, mistakes: list[str]) -> dict[str, list[Point]]:
         else:
             by_value = any(word in axis for word in BY_VALUE)
             found[name] = _points_by_value(key, axis, mistakes) if by_value else _named_points(key, axis, mistakes)
-            for what in sorted({what for point in found[name] for what in point.touches()}):
-                if by.setdefault(what, name) != name:
-                    mistakes.append(f"{key}: decides {shown(what)}, as axis.{by[what]} does")
+    mistakes += _clashes(found)
     return {name: points for name, points in found.items() if points}  # what the others say can still be judged
+
+
+def _clashes(axes: Mapping[str, list[Point]]) -> Iterator[str]:
+    """Yield what two axes decide: the same, or one a table and the other what stands in it."""
+    by: dict[str, str] = {}
+    inside: dict[str, tuple[str, str]] = {}  # by table: who decides what of it
+    for name, points in axes.items():
+        mine = {what: _around(what) for what in sorted({what for point in points for what in point.touches()})}
+        for what, around in mine.items():
+            here = f"axis.{name}: decides {shown(what)}"
+            table = next((table for table in around if table in by), None)
+            if what in by:
+                yield f"{here}, as axis.{by[what]} does"
+            elif table is not None or what in inside:
+                axis, other = inside[what] if table is None else (by[table], table)
+                yield f"{here}, and axis.{axis} {shown(other)}: one would undo what the other sets"
+        for what, around in mine.items():
+            by.setdefault(what, name)
+            for table in around:
+                inside.setdefault(table, (name, what))
+
+
+def _around(key: str) -> list[str]:
+    """Return the tables that a dotted key stands in."""
+    parts = key.split(".")
+    return [".".join(parts[:n]) for n in range(1, len(parts))]
 
 
 def _points_by_value(key: str, axis: dict[str, Any], mistakes: list[str]) -> list[Point]:
@@ -222,6 +232,12 @@ def _excluded(
         return []
     found = []
     for number, rule in enumerate(given):
+        wrong = [axis for axis, points in rule.items() if points == [] or is_dated(points)]
+        mistakes += [
+            f"exclude.{number}.{shown(axis)} = {shown(rule[axis])}: must be a point or several" for axis in wrong
+        ]
+        if wrong:
+            continue
         wanted = {axis: [point_text(one) for one in (v if isinstance(v, list) else [v])] for axis, v in rule.items()}
         right = True
         for axis, points in wanted.items():
@@ -251,6 +267,8 @@ def _settings(key: str, given: Any, mistakes: list[str]) -> dict[str, str]:
         if isinstance(value, dict) and "." not in name:
             # TOML reads time.end = 1 as a table [time], which as a setting would take the place of the scene's own
             mistakes.append(f'{key}.{shown(name)}: is a table; keys of a scene stand in quotes: "{shown(name)}...." = ')
+        elif is_dated(value):
+            mistakes.append(f"{key}.{shown(name)}: no setting is a date or a time; a text stands in quotes")
         else:
             found[name] = as_toml(value)
     return found
@@ -262,7 +280,7 @@ def _options(key: str, given: Any, mistakes: list[str]) -> dict[str, str]:
         return {}
     found = {}
     for name, value in given.items():
-        if isinstance(value, dict | list):
+        if not isinstance(value, int | float | str):
             mistakes.append(f"{key}.{shown(name)}: an option's value is a number, a text, true or false")
         elif name.lstrip("-").lower() == "options_file":
             mistakes.append(f"{key}.{shown(name)}: options_file is a word of its own, beside options")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,10 +30,14 @@ def point_text(value: Any) -> str:
 
 
 def same_point(text: str, wanted: str) -> bool:
-    """Return whether a point is meant: by its text, or as the same number, 1e-6 for 1e-06."""
+    """Return whether a point is meant: by its text, or as the same number or list, 1e-6 for 1e-06."""
+    if text == wanted:
+        return True
     try:
-        return text == wanted or float(text) == float(wanted)
-    except ValueError:
+        if text.startswith("[") and wanted.startswith("["):
+            return bool(tomllib.loads(f"v = {text}")["v"] == tomllib.loads(f"v = {wanted}")["v"])
+        return float(text) == float(wanted)
+    except (ValueError, RecursionError):  # TOML that is wrong is a ValueError, too
         return False
 
 

@@ -24,6 +24,7 @@ from petfsi.scene.dump import as_toml, dump_scene
 from petfsi.scene.load import apply_set, scene_from_dict
 from petfsi.scene.raw import read_raw
 from petfsi.solving import options
+from petfsi.solving.option_rules import PREFIX
 from petfsi.sweeps.file import MOST_RUNS, Point, SweepFile, read_sweep_file
 from petfsi.sweeps.names import run_name
 
@@ -31,6 +32,8 @@ from petfsi.sweeps.names import run_name
 INPUTS = "inputs"
 #: Digits of digests in names of files.
 _DIGITS = 12
+#: Runs that are the same as others, of those that are told.
+_TOLD = 8
 
 
 @dataclass(frozen=True)
@@ -123,6 +126,8 @@ class _Planner:
         self._base: dict[str, Any] = {}
         self._scenes: dict[str, tuple[str, dict[str, str]] | None] = {}
         self._options: dict[str, tuple[list[str], dict[str, str]] | None] = {}
+        self._names: dict[tuple[str | int, ...], str] = {}
+        self._twins: list[str] = []
 
     def build(self) -> None:
         """Fill the plan."""
@@ -139,6 +144,10 @@ class _Planner:
         for repeat in range(1, file.repeat + 1):
             for points in _combinations(file):
                 self._add(points, repeat)
+        if len(self._twins) > _TOLD:
+            self._twins[_TOLD:] = [f"and {len(self._twins) - _TOLD} more runs are the same as others"]
+        if not self.mistakes:  # else one of them may be why runs are the same
+            self.mistakes += self._twins
         if not self.plan.runs and not self.mistakes:
             self.mistakes.append("exclude: leaves no run")
 
@@ -151,6 +160,11 @@ class _Planner:
         ranks = next((point.ranks for point in points.values() if point.ranks), 1)
         steps = self.file.steps
         says = {**scene[1], **chosen[1], "ranks": str(ranks), "repeat": str(repeat), "steps": str(steps or "all")}
+        first = self._names.setdefault((scene[0], *chosen[0], ranks, repeat), name)
+        if first != name:
+            self._twins.append(
+                f"run {name}: is the same as {first}: nothing differs, or one axis undoes what another sets"
+            )
         self.plan.runs.append(Planned(name, texts, ranks, repeat, steps, scene[0], chosen[0], says))
 
     def _scene(self, points: Mapping[str, Point], name: str) -> tuple[str, dict[str, str]] | None:
@@ -206,21 +220,26 @@ class _Planner:
         return self._options[key]
 
     def _read_options(self, file: str, given: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
-        words, says = [], {f"-{option}": value for option, value in given.items()}
+        """Return the words of options, and by ``-name`` what they are; InputError if they are wrong."""
+        says = {f"-{option}": value for option, value in given.items()}
         over = [word for option, value in given.items() for word in (f"-{option}", value) if word]
-        if file:
-            beside = self.file.path.parent / file
-            named = file if os.path.basename(file) == file and not beside.exists() else str(beside)
-            read = options.from_file(named)
-            options.resolve([f"-{options.FILE}", named, *over], {})
-            own = bool(read) and all(option.shipped for option in read)
-            if not own:
-                says |= {f"{named_as(file)}: -{option.name}": option.value for option in read}
-            words = [f"-{options.FILE}", os.path.basename(file) if own else self._own_file(file, read)]
-            says[f"-{options.FILE}"] = os.path.basename(file)
-        else:
-            options.resolve(over, {})
-        return [*words, *over], says
+        if not file:
+            _check_options(over)
+            return over, says
+        path = self._options_path(file)
+        _check_options([f"-{options.FILE}", str(path), *over])
+        name = says[f"-{options.FILE}"] = os.path.basename(file)  # where it is does not change a run
+        if path.resolve().parent == options.options_directory().resolve():
+            return [f"-{options.FILE}", path.resolve().name, *over], says
+        read = options.from_file(str(path))
+        says |= {f"{name}: -{option.name}": option.value for option in read}
+        return [f"-{options.FILE}", self._own_file(file, read), *over], says
+
+    def _options_path(self, file: str) -> Path:
+        """Return where an options file is: beside the sweep's file, or, as a bare name that is not there, shipped."""
+        beside = self.file.path.parent / file
+        shipped = [path for path in options.shipped_options() if path.name == file]
+        return shipped[0] if shipped and not beside.exists() else beside
 
     def _own_file(self, file: str, read: list[options.Option]) -> str:
         """Return the name of a copy of an options file that needs none beside it but petfsi's own."""
@@ -239,15 +258,21 @@ class _Planner:
     def _tell(self, text: str, points: Mapping[str, Point], name: str) -> None:
         """Add what is wrong with a combination; what is wrong with all of them is told once."""
         first, *rest = text.split("\n")
-        for line in rest or [first]:
+        headed = bool(rest) and rest[0].startswith("  ")  # as of scenes; of options every line is a mistake
+        for line in rest if headed else [first, *rest]:
             line = line.strip()
             if not any(line in told for told in self.mistakes):
                 self.mistakes.append(f"run {name}: {line}" if points else line)
 
 
-def named_as(file: str) -> str:
-    """Return an options file's name without its folder: where it is does not change a run."""
-    return os.path.basename(file)
+def _check_options(words: list[str]) -> None:
+    """Raise InputError with every option that is refused, or that no run would read."""
+    unread = options.resolve(words, {}).left_out
+    if unread:
+        lines = [
+            f"{one.place}option -{shown(one.name)}: is read by nothing; petfsi's begin with -{PREFIX}" for one in unread
+        ]
+        raise InputError("\n".join(lines))
 
 
 def _combinations(file: SweepFile) -> Iterator[dict[str, Point]]:

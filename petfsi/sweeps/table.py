@@ -13,7 +13,7 @@ from petfsi.sweeps.folder import SweepFolder
 from petfsi.sweeps.plan import Planned
 from petfsi.sweeps.states import Look, look_at
 
-#: Columns that every table has; an axis of such a name is ``axis.NAME``.
+#: Columns that every table has; an axis of such a name, or with a dot as in ``last.PROBE``, is ``axis.NAME``.
 FIXED = ["name", "state", "kind", "reason", "steps", "time", "ranks", "repeat", "unknowns"]
 FIXED += ["iterations_mean", "iterations_max", "wall_s", "peak_mb", "attempts"]
 
@@ -33,7 +33,7 @@ def row_of(run: Planned, look: Look) -> dict[str, Any]:
     unknowns = _table(told, "unknowns")
     peak = max((attempt.peak_kb for attempt in look.attempts), default=0)
     row: dict[str, Any] = {"name": run.name}
-    row |= {(f"axis.{axis}" if axis in FIXED else axis): point for axis, point in run.axes.items()}
+    row |= {(f"axis.{axis}" if axis in FIXED or "." in axis else axis): point for axis, point in run.axes.items()}
     row |= {
         "state": look.state,
         "kind": look.kind if look.state == "failed" else "",

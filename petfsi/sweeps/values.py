@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import date, time
 from typing import Any
 
 from petfsi.messages import shown
@@ -19,7 +20,17 @@ def read_values(key: str, given: Any, mistakes: list[str]) -> list[Any]:
     if not isinstance(given, list) or not 0 < len(given) <= MOST:
         mistakes.append(f"{key}: must be a list of 1 to {MOST:,} values, or {{ from, factor or step, count }}")
         return []
+    if is_dated(given):
+        mistakes.append(f"{key}: no value is a date or a time; a text stands in quotes")
+        return []
     return given
+
+
+def is_dated(value: Any) -> bool:
+    """Return whether a value of TOML is a date or a time, or holds one."""
+    if isinstance(value, dict | list):
+        return any(is_dated(one) for one in (value.values() if isinstance(value, dict) else value))
+    return isinstance(value, date | time)
 
 
 def _series(key: str, given: dict[str, Any], mistakes: list[str]) -> list[Any]:
