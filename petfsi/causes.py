@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from petfsi.errors import FinalError, NoSolutionError, SolveError, TouchError
 from petfsi.fields.solids import SolidField
 from petfsi.scene.schema import Time
+from petfsi.solving.equations import Equations
 from petfsi.solving.splitting import SplitWatch
 from petfsi.touch import WHY, Watch
 
@@ -66,6 +67,18 @@ def elements_named(solid: SolidField | None) -> Iterator[None]:
 
 
 @contextmanager
+def squeezing_named(equations: Equations, last: bool) -> Iterator[None]:
+    """Say that what comes into a closed region squeezes its solids where the last try of a step fails. Collective."""
+    try:
+        yield
+    except SolveError as error:
+        said = equations.squeezed() if last and not isinstance(error, FinalError) else ""
+        if not said:
+            raise
+        raise type(error)(f"{said}. The step failed of it: {_without_advice(error)}") from error
+
+
+@contextmanager
 def splitting_named(watch: SplitWatch | None) -> Iterator[None]:
     """Say that time splitting is unstable if that shows when a step fails inside of it, in whatever way. Collective.
 
@@ -77,8 +90,12 @@ def splitting_named(watch: SplitWatch | None) -> Iterator[None]:
         said = watch.story() if watch is not None else ""
         if not said:
             raise
-        what = str(error).split(". ")[0].rstrip(".")
-        raise FinalError(f"{said}. The step failed of it: {what}") from error
+        raise FinalError(f"{said}. The step failed of it: {_without_advice(error)}") from error
+
+
+def _without_advice(error: SolveError) -> str:
+    """Return what has failed, in a word: the first sentence."""
+    return str(error).split(". ")[0].rstrip(".")
 
 
 def advice(time: Time, solid: SolidField | None, exact: bool, splitting: SplitWatch | None) -> str:

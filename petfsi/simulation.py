@@ -185,11 +185,13 @@ class Simulation:
                 field.predict(t, dt)
             if self.solid and not self.solid.explicit:  # before anything looks for where that is
                 self._check_speed(self.solid, self.solid.predicted() / dt, dt)
-        with causes.splitting_named(self.splitting), causes.touch_named(self.solid, self.watch, t, dt, last):
+        touch = causes.touch_named(self.solid, self.watch, t, dt, last)
+        with causes.splitting_named(self.splitting), touch, causes.squeezing_named(self.equations, last):
             outcome = self._solve(t, dt)
         if self.splitting is not None:
             self.splitting.judge(self.system)
-        with self.phase("accept"), causes.splitting_named(self.splitting):
+        squeezing = causes.squeezing_named(self.equations, last)
+        with self.phase("accept"), causes.splitting_named(self.splitting), squeezing:
             self._accept(t, dt)
             if not isinstance(self.solver, DiagonalSolver):  # else no step makes any
                 petsc.collect_garbage()

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from step_cases import prepared
 
-from petfsi.errors import InputError, NoSolutionError
+from petfsi.errors import InputError, NoSolutionError, SolveError
 from petfsi.runs.ready import made_ready
 from petfsi.scene.schema import Scene
 
@@ -159,6 +159,21 @@ def test_what_can_leave_no_longer_fails_the_step_at_once(name):
                 sim.advance()
     assert said in str(found.value) and not any("two halves" in text for text in told)
     assert step is None or sim.step == step - 1
+
+
+@pytest.mark.parametrize(
+    ("sides", "said"),
+    [({"left": jet(1.0), "right": jet(1.0)}, "sides.left.inflow +0.4, fluid.sides.right.inflow +0.4 m^2/s"),
+     ({"left": jet(1.0)}, "sides.left.inflow +0.4 m^2/s")],
+)  # fmt: skip
+def test_what_only_solids_give_way_to_is_named_where_a_step_fails(sides, said):
+    scene = flow(sides, {"b": box([0.4, 0.1], [0.2, 0.2])}, dt=0.01)
+    with prepared(scene) as sim, pytest.raises(SolveError, match=r"solids alone give way to what comes in") as found:
+        for _ in range(20):
+            sim.advance()
+    told = str(found.value)
+    assert said in told and "Let as much out as in, or open a side. The step failed of it: s" in told
+    assert 0 < float(re.search(r"solids.b has (\S+) times the volume that it has at rest", told)[1]) < 0.9
 
 
 #: What balances, or what something gives way to.

@@ -322,11 +322,60 @@ def test_an_inflow_that_swings_is_seen_wherever_it_is_nothing_at_equal_times():
 
 def test_a_jet_with_a_way_out_is_none_into_a_closed_box():
     slow = {"inflow": JET["inflow"] | {"speed": 0.1}}
+    region = {"box": {"origin": [2.0, 0.5], "size": [2.0, 0.1]}}
     for sides in (
         {"left": slow, "right": {"pressure": 0.0}}, {"left": {"inflow": slow["inflow"] | {"rest": "open"}}},
-        {"left": slow, "right": {"inflow": {"speed": -0.1}}},
+        {"left": slow, "right": {"inflow": {"speed": -0.1, "region": region}}},
     ):  # fmt: skip
-        assert "can leave nowhere" not in "".join(warned(scene(bar(), water(sides=sides))))
+        assert "no side is open" not in "".join(warned(scene(bar(), water(sides=sides))))
+
+
+def jets(**speeds):
+    """A solid of .1 m^2 in a box with sides of 4 m that speeds are given of."""
+    return scene(bar(), water(sides={side: {"inflow": {"speed": v}} for side, v in speeds.items()}))
+
+
+BALLS = {side: {"inflow": {"speed": 1.0, "region": {"ball": {"centre": [x, 0.0], "radius": 0.3}}}}
+         for side, x in (("left", -1.0), ("right", 3.0))}  # fmt: skip
+NET = {
+    "one": (jets(left=1.0), "fluid.sides.left: what comes in can leave nowhere", "to nothing by t = 0.03 s"),
+    "two": (jets(left=0.5, right=0.5), "fluid.sides.left, right: what comes in can", "to nothing by t = 0.03 s"),
+    "more in than out": (jets(left=1.0, right=-0.98), "left, right: what comes in", "by 80% of their volume by t = 1"),
+    "out": (jets(left=-1.0), "left: what is drawn out comes in nowhere", "by 100% of their volume by t = 0.03 s"),
+    "it swings": (jets(left="pi/40*sin(2*pi*t)"), "left: what comes in", "squeezed to nothing by t = 0.5 s"),
+    "parts of sides": (scene(bar(), water(sides=BALLS)), "left, right: what comes in", "to nothing by t = 0.09 s"),
+    "a ramp": (
+        scene(bar(), water(sides={"left": {"inflow": {"speed": 0.025, "ramp": 1.0}}})),
+        "left: what comes in", "by 50% of their volume by t = 1 s",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("made", "said", "much"), NET.values(), ids=NET)
+def test_of_a_closed_box_it_is_told_what_comes_in_net(made, said, much):
+    (line,) = [line for line in warned(made)[0].splitlines() if "no side is open" in line]
+    assert said in line and much in line
+
+
+@pytest.mark.parametrize(
+    ("speeds", "told"),
+    [({"left": "sin(pi*y/2)"}, ""), ({"left": 0.0}, ""), ({"left": "6*(y+1)*(3-y)/16", "right": -1.0}, ""),
+     ({"left": "1e-3*pi*sin(2*pi*t)"}, "left: no side is open: solids shrink by 4% of their volume by t = 0.5 s"),
+     ({"left": "-1e-3*pi*sin(2*pi*t)"}, "left: no side is open: solids swell by 4% of their volume by t = 0.5 s")],
+)  # fmt: skip
+def test_what_comes_to_nothing_or_little_in_a_closed_box_is_not_warned_of(speeds, told):
+    warnings, notes = warned(jets(**speeds))
+    assert "no side is open" not in warnings
+    assert told in notes if told else "no side is open" not in notes
+
+
+@pytest.mark.parametrize(("across", "said"), [(3.98, "is 3.98 of"), (3.99996, "is 3.99996 of"), (3.84, "is 3.8 of")])
+def test_what_is_too_few_across_is_said_in_digits_that_show_it(across, said):
+    for size, advice in (((across, across), "1.1 times finer fluid.cells"), ((across, 10.0), "where it is thinnest")):
+        size = [0.1 * side for side in size]
+        told = "\n".join(warned(scene(bar((40, 40), size, None), water())))
+        assert said in told and advice in told
+        assert "4 of the fluid" not in told
 
 
 def test_a_narrow_inflow_is_seen():

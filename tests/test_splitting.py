@@ -154,6 +154,7 @@ def test_what_grows_in_one_direction_is_a_load_that_sets_in(grows, turn):
 def test_what_grows_and_turns_round_is_stopped_and_says_from_where(factor, turn):
     n, said = steps_watched(factor ** np.arange(9.0), turn=turn)
     assert n == 3 and f"has risen from 1.0e+00 to {factor**3:.1e} in 3 steps" in said
+    assert "More fluid moves with the solid, or with a part of its surface, than that weighs" in said
 
 
 @pytest.mark.parametrize(

@@ -197,6 +197,10 @@ class JointSolid(SolidField):
         """Return which body of any part has an element inside out. Collective."""
         return "; ".join(filter(None, [part.inside_out() for part in self.parts]))
 
+    def volume_ratios(self) -> dict[str, float]:
+        """Return those of all parts. Collective."""
+        return {name: ratio for part in self.parts for name, ratio in part.volume_ratios().items()}
+
     def foreseen(self) -> np.ndarray:
         """Return the solution of all parts as known before the solve."""
         return np.concatenate([part.foreseen() for part in self.parts])

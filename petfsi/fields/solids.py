@@ -91,6 +91,10 @@ class SolidField(Field):
         """
         return ""
 
+    def volume_ratios(self) -> dict[str, float]:
+        """Return by body how many times its volume at rest it encloses; without bodies that keep theirs. Collective."""
+        return {}
+
     def remark(self, dt: float) -> str | None:
         """Return what a user should know of the step of dt last accepted, each thing once. Collective."""
         return None

@@ -1,7 +1,8 @@
-"""Notes on a fluid: whether it resolves solids, how far it goes in a step, and what it weighs beside solids."""
+"""Notes on a fluid: whether it resolves solids, where it may go, how far in a step, and what it weighs beside them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -15,6 +16,7 @@ from petfsi.notes.note import Note, Notes, View
 from petfsi.scene.expressions import Expression, ExpressionError
 from petfsi.scene.fluid_kinds import Fluid
 from petfsi.scene.fluids import MacFluid
+from petfsi.scene.schema import Scene
 from petfsi.scene.shape_checks import OPPOSITE
 from petfsi.scene.sides import Inflow, InflowSide, open_side
 from petfsi.scene.tables import Number
@@ -25,6 +27,12 @@ ENOUGH = 4.0
 FAST = 5.0
 #: Places along each axis, on a line, over a side and in a box, and instants of the run at which speeds are looked at.
 PLACES, INSTANTS = (1, 257, 33, 9), 97
+#: Of what flows in and out at once this part may be left: places and instants say no more of it.
+BALANCED = 0.01
+#: Solids may give way by this part of their volume without a word, and by that one without a warning.
+SLIGHT, MUCH = 1e-6, 0.1
+#: Speeds of a jet that are looked at in all: at each step, if that is not too many.
+SAMPLES = 1 << 18
 #: What is below that many cells a step is round-off.
 NOTHING = 1e-9
 _ROUND_OFF = 1e-9
@@ -43,12 +51,12 @@ def resolution(view: View) -> Notes:
         across = _across(form, cell)
         if across.min() >= ENOUGH - _ROUND_OFF:
             continue
-        said, second = f"solids.{name} is {across.min():.2g} of the fluid's {unit} across", np.sort(across)[1]
+        said, second = f"solids.{name} is {_below(across.min())} of the fluid's {unit} across", np.sort(across)[1]
         if second < ENOUGH - _ROUND_OFF:
-            finer = ENOUGH / second
+            finer = math.ceil(10 * ENOUGH / second - _ROUND_OFF) / 10
             yield Note(
-                f"solids.{name} is {second:.2g} of the fluid's {unit} across, where {ENOUGH:g} are few: forces on it "
-                f"are coarse; {finer:.2g} times finer {key} help",
+                f"solids.{name} is {_below(second)} of the fluid's {unit} across, where {ENOUGH:g} are few: forces on "
+                f"it are coarse; {finer:.3g} times finer {key} help",
                 warns=True,
             )
         elif scene.transfer == "ray":
@@ -63,6 +71,11 @@ def resolution(view: View) -> Notes:
                 f"{said} where it is thinnest: the fluid on its sides is kept apart, but the flow around its edges is "
                 f"as coarse as the {unit}"
             )
+
+
+def _below(number: float) -> str:
+    """Return a number that is too small in as many digits as show that it is; two, as a rule."""
+    return next((said for n in range(2, 12) if float(said := f"{number:.{n}g}") < ENOUGH), f"{ENOUGH:g}")
 
 
 def _cell(fluid: Fluid) -> np.ndarray:
@@ -82,19 +95,97 @@ def _across(form: Form, cell: np.ndarray) -> np.ndarray:
     return lengths / np.linalg.norm(form.axes * cell, axis=1)
 
 
+# ---- what closed boxes take ---------------------------------------------------------------------------------
+
+
 def nowhere_to_go(view: View) -> Notes:
-    """Warn of a jet into a box that no side opens: where no solid could give way either, that is an error."""
+    """Tell what jets let into a box that no side opens: where no solid could give way either, that is an error.
+
+    Solids give way to the volume V(t) that has come in, net, from all sides since the start; it is judged beside theirs
+    where it is largest, by size.
+    """
     scene = view.scene
     if not isinstance(scene.fluid, MacFluid) or not scene.solids:
         return
     sides = {side: getattr(scene.fluid.sides, side) for pair in OPPOSITE[: scene.dim] for side in pair}
-    jets = [side for side, form in sides.items() if isinstance(form, InflowSide)]
-    if len(jets) == 1 and not any(open_side(form) for form in sides.values()):
-        yield Note(
-            f"fluid.sides.{jets[0]}: what comes in can leave nowhere, as no side is open; solids alone give way to it, "
-            f'until they are squeezed to nothing; let another side be "open"',
-            warns=True,
+    jets = {side: form.inflow for side, form in sides.items() if isinstance(form, InflowSide)}
+    if not jets or any(open_side(form) for form in sides.values()):
+        return
+    # a beam bends, but its cross section stays as it is
+    room = sum(math.prod(form.lengths) for name, form in view.forms.items() if not scene.solids[name].shape.beam)
+    if not room:
+        return
+    try:
+        t, came = _net_volume(view, jets)
+    except ExpressionError:  # is told of by those who need the speed
+        return
+    part = came / room
+    most = float(np.abs(part).max())
+    if not most > SLIGHT:
+        return
+    first = int(np.argmax(np.abs(part) >= min(most, 1.0)))
+    yield _closed_box(f"fluid.sides.{', '.join(jets)}", most, part[first] > 0, f"by t = {t[first]:.2g} s")
+
+
+def _closed_box(keys: str, part: float, enters: bool, when: str) -> Note:
+    """Return the note of sides that change the volume of solids by a part of it, the fluid having no other way."""
+    if part < MUCH:
+        change = "shrink" if enters else "swell"
+        return Note(f"{keys}: no side is open: solids {change} by {100 * part:.3g}% of their volume {when}")
+    if enters:
+        end = "to nothing" if part >= 1.0 else f"by {100 * part:.3g}% of their volume"
+        said = (
+            f"what comes in can leave nowhere, as no side is open; solids alone give way to it, squeezed {end} {when}"
         )
+    else:
+        said = (
+            "what is drawn out comes in nowhere, as no side is open; solids alone make up for it, stretched by "
+            f"{100 * min(part, 1.0):.3g}% of their volume {when}"
+        )
+    return Note(f'{keys}: {said}; let another side be "open"', warns=True)
+
+
+def _net_volume(view: View, jets: Mapping[str, Inflow]) -> tuple[np.ndarray, np.ndarray]:
+    """Return instants of the run, s, and the volume that has come in through all jets until then, m^3 (m^2 in 2D)."""
+    scene, dim = view.scene, view.scene.dim
+    fluid = scene.fluid
+    assert fluid is not None
+    low, high = np.array(fluid.origin, dtype=float), np.array(fluid.origin, dtype=float) + fluid.size
+    steps = scene.time.end / view.dt if view.dt else math.inf
+    number = max(INSTANTS, math.ceil(min(steps, SAMPLES / PLACES[dim - 1] ** (dim - 1))))
+    # in the middle of steps: the sum of a flow that swings then swings no more than it
+    t = scene.time.end * (np.arange(number) + 0.5) / number
+    net, gross = np.zeros(number), np.zeros(number)
+    for side, jet in jets.items():
+        axis, upper = next((a, pair.index(side)) for a, pair in enumerate(OPPOSITE) if side in pair)
+        at, area = _patches(jet, low, high, axis, (low, high)[upper][axis])
+        at = at[~_covered(scene, at)]
+        coordinates = {"z": 0.0, **dict(zip("xyz", at.T, strict=False))}
+        speed = np.broadcast_to(Expression(jet.speed)(t=t[:, None], **coordinates), (number, len(at)))
+        opened = np.sin(np.pi / 2 * np.minimum(t / jet.ramp, 1.0)) ** 2 if jet.ramp else np.ones(number)
+        net += area * opened * speed.sum(axis=1)
+        gross += area * opened * np.abs(speed).sum(axis=1)
+    net[np.abs(net) <= BALANCED * gross] = 0.0
+    return t + t[0], np.cumsum(net) * 2 * t[0]
+
+
+def _patches(inflow: Inflow, low: np.ndarray, high: np.ndarray, axis: int, end: float) -> tuple[np.ndarray, float]:
+    """Return the middles of equal patches of what part of a side lets something in, and the area of each."""
+    low, high = _reach(inflow, low, high, axis, end)
+    number = np.where(np.arange(len(low)) == axis, 1, PLACES[len(low) - 1])
+    middle = (high - low) / number / 2
+    at = _places(low + middle, high - middle)
+    area = float(np.prod(np.delete(2 * middle, axis)))
+    return (at if inflow.region is None else at[inside(inflow.region, at)]), area
+
+
+def _covered(scene: Scene, at: np.ndarray) -> np.ndarray:
+    """Return which points lie in an obstacle that is no mesh."""
+    covered = np.zeros(len(at), dtype=bool)
+    for obstacle in scene.obstacles.values():
+        if obstacle.shape.mesh is None:
+            covered |= inside(obstacle.shape, at) != obstacle.outside
+    return covered
 
 
 # ---- speeds -------------------------------------------------------------------------------------------------
@@ -166,13 +257,18 @@ def _places(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 def _opening(inflow: Inflow, low: np.ndarray, high: np.ndarray, axis: int, end: float) -> np.ndarray:
     """Return points all over the part of a side that lets something in; none if that is too small to be seen."""
+    at = _places(*_reach(inflow, low, high, axis, end))
+    return at if inflow.region is None else at[inside(inflow.region, at)]
+
+
+def _reach(inflow: Inflow, low: np.ndarray, high: np.ndarray, axis: int, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the box about the part of a side that lets something in."""
     low, high = low.copy(), high.copy()
     reach = None if inflow.region is None else bounds(inflow.region)
     if reach is not None:
         low, high = np.maximum(low, reach[0]), np.minimum(high, reach[1])
     low[axis] = high[axis] = end
-    at = _places(low, np.maximum(low, high))
-    return at if inflow.region is None else at[inside(inflow.region, at)]
+    return low, np.maximum(low, high)
 
 
 def _largest(values: Sequence[Number], at: np.ndarray, t: np.ndarray, dt: float | None = None) -> np.ndarray:
@@ -205,7 +301,7 @@ def masses(view: View) -> Notes:
     many = f" and {len(ratios) - 5} more" if len(ratios) > 5 else ""
     yield Note(
         f"mass ratio, solid to fluid: {', '.join(ratios[:5])}{many}; only split.opts minds it: it is unstable where "
-        "the fluid that moves with a solid outweighs it"
+        "more fluid moves with a solid, or with a part of its surface, than that weighs"
     )
     if not view.splits:
         return

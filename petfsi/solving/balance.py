@@ -10,6 +10,8 @@ from petfsi.solving.regions import ClosedRegions
 LEFT_OVER = 1e-8
 #: Sums of flows that cancel leave less than this part of them.
 ROUND_OFF = 1e-13
+#: Bodies that what comes in has squeezed to less than this part of their volume, or swollen as much, are worth a word.
+SQUEEZED = 0.9
 
 
 class Balance:
@@ -70,8 +72,44 @@ class Balance:
         parts += [] if rate is None else [rate]
         return sum(parts[1:], parts[0]) if parts else None
 
+    def squeezed(self) -> str:
+        """Return what flows into a closed region to which solids alone yield, if it has squeezed them. Collective.
+
+        Such a step has a solution as long as the material bears it: nobody knows beforehand.
+        """
+        parts = self.solid.volume_ratios() if self.solid is not None else {}
+        for q, elastic in zip(self.regions.members, self.regions.elastic, strict=True):
+            if not parts or not elastic:
+                continue
+            named, flows = self._flows(q)
+            net = float(flows.sum())
+            if abs(net) <= LEFT_OVER * np.abs(flows).sum():
+                continue
+            name = min(parts, key=parts.__getitem__) if net > 0 else max(parts, key=parts.__getitem__)
+            if (net > 0 and parts[name] < SQUEEZED) or (net < 0 and parts[name] > 1 / SQUEEZED):
+                return (
+                    f"{named}: the fluid in {self.fluid.place(q)} is closed, and solids alone "
+                    f"{'give way to what comes in' if net > 0 else 'make up for what is drawn out'}: solids.{name} has "
+                    f"{parts[name]:.3g} times the volume that it has at rest. Let as much out as in, or open a side"
+                )
+        return ""
+
     def _story(self, q: np.ndarray) -> str:
         """Return what flows into the regions of an unfelt pressure. Collective."""
+        named, flows = self._flows(q)
+        net = float(flows.sum())
+        return (
+            f"{named}: what is let in and out does not balance: the fluid in {self.fluid.place(q)} "
+            f"is closed, and nothing around it yields, but it would have to {'take up' if net > 0 else 'give off'} "
+            f"{abs(net):.4g} {self._unit}. Let as much out as in, open a side, or let a wall give way"
+        )
+
+    @property
+    def _unit(self) -> str:
+        return "m^3/s" if self.fluid.dim == 3 else "m^2/s"
+
+    def _flows(self, q: np.ndarray) -> tuple[str, np.ndarray]:
+        """Return what is let in with a pressure's weights, by what lets it in, in words and as such. Collective."""
         system, solid = self.regions.system, self.solid
         ends = system.comm.allgather((q.min(initial=0.0), q.max(initial=0.0)))
         q = q / max((value for pair in ends for value in pair), key=abs)
@@ -82,15 +120,9 @@ class Balance:
             if outflow is not None:
                 parts[f"solids.{name}.supports"] = -(q @ outflow)
         values = system.comm.allreduce(np.array(list(parts.values())))
-        unit = "m^3/s" if self.fluid.dim == 3 else "m^2/s"
         named = [
             f"{key} {value:+.4g}"
             for key, value in zip(parts, values, strict=True)
             if abs(value) > LEFT_OVER * np.abs(values).max()
         ]
-        net = float(values.sum())
-        return (
-            f"{', '.join(named)} {unit}: what is let in and out does not balance: the fluid in {self.fluid.place(q)} "
-            f"is closed, and nothing around it yields, but it would have to {'take up' if net > 0 else 'give off'} "
-            f"{abs(net):.4g} {unit}. Let as much out as in, open a side, or let a wall give way"
-        )
+        return f"{', '.join(named)} {self._unit}", values

@@ -105,8 +105,9 @@ def _advice(method: Method, culprit: PETSc.KSP) -> str:
     whole = culprit.getOptionsPrefix() == method.prefix
     if whole and method.decoupled and culprit.getType() == PETSc.KSP.Type.RICHARDSON:
         return (
-            "Iterated splitting diverges where the fluid that moves with the solid outweighs it (added mass), its "
-            "stiffness and damping in a step included: go on with -options_file monolithic.opts."
+            "Iterated splitting diverges where more fluid moves with the solid, or with a part of its surface, than "
+            "that weighs (added mass), its stiffness and damping in a step included: go on with -options_file "
+            "monolithic.opts."
         )
     if whole and culprit.getPC().getType() in (PETSc.PC.Type.LU, PETSc.PC.Type.CHOLESKY):
         return "Smaller steps may help; look at densities, stiffness and supports."

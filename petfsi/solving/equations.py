@@ -95,6 +95,13 @@ class Equations:
         if balance.make_up():
             self.system.refresh(guess=False)
 
+    def squeezed(self) -> str:
+        """Return what comes into a closed region whose solids it squeezes, or nothing; of a step assembled. Collective.
+
+        See ``Balance.squeezed``.
+        """
+        return Balance(self.regions).squeezed() if self.regions else ""
+
     def check(self, t: float, dt: float) -> None:
         """Refuse a scene whose first step, assembled, has no solution: before anything is written. Collective.
 

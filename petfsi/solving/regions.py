@@ -76,6 +76,16 @@ class ClosedRegions:
         self._stride = 0.0
 
     @property
+    def members(self) -> list[np.ndarray]:
+        """Of each present region, 1 on its unknowns and 0 elsewhere: this rank's part."""
+        return self._tracker.members
+
+    @property
+    def elastic(self) -> np.ndarray:
+        """Which of these a solid bounds."""
+        return self._tracker.elastic
+
+    @property
     def volumes(self) -> np.ndarray:
         """Of each region that was closed at first, see ``Tracked``."""
         return self._tracker.volumes

@@ -27,11 +27,12 @@ MOST = 1e150
 class SplitWatch:
     """Watches the equations of each body, which a splitting scheme solves under the old pressure.
 
-    What is left of them is the change of the pressure, J (p - p_old). Where the fluid that moves with a body outweighs
-    it (its added mass m_a exceeds m), the pressure of a step pushes back what the last one pushed too far: what is
-    left turns round in every step and grows by about m_a / m, and a step is worse than none, |b - Kx| > |b|. Every mode
-    that grows does so by a negative factor, whatever its stiffness and damping. A load that sets in leaves more and
-    more, too, at whatever rate, but all of it in one direction.
+    What is left of them is the change of the pressure, J (p - p_old). Where more fluid moves with a body, or in a mode
+    of its surface alone, than that weighs (its added mass m_a exceeds m, which it may where the whole body is much
+    heavier), the pressure of a step pushes back what the last one pushed too far: what is left turns round in every
+    step and grows by about m_a / m, and a step is worse than none, |b - Kx| > |b|. Every mode that grows does so by a
+    negative factor, whatever its stiffness and damping. A load that sets in leaves more and more, too, at whatever
+    rate, but all of it in one direction.
 
     Each body is judged by its own equations: beside what a heavy one bears, an unstable light one is nothing in a sum.
 
@@ -100,10 +101,10 @@ class SplitWatch:
         name, first = self._solid.names[worst], self._left[worst, -1 - n]
         return (
             f"time splitting is unstable here: what it leaves over in the equations of solids.{name}, |b - Kx|, has "
-            f"risen from {first:.1e} to {left[worst]:.1e} in {n} step{'s' * (n > 1)}. The fluid that moves with the "
-            f"solid outweighs it (added mass), and smaller steps make that worse. Start again with -options_file "
-            f"monolithic.opts; split-iterated.opts holds only where the solid's stiffness and damping in a step "
-            f"outweigh that fluid"
+            f"risen from {first:.1e} to {left[worst]:.1e} in {n} step{'s' * (n > 1)}. More fluid moves with the "
+            f"solid, or with a part of its surface, than that weighs (added mass), and smaller steps make that worse. "
+            f"Start again with -options_file monolithic.opts; split-iterated.opts holds only where the solid's "
+            f"stiffness and damping in a step outweigh that fluid"
         )
 
     def keep(self) -> Callable[[], State]:

@@ -226,8 +226,16 @@ class SimplexSolid(NodalSolid):
 
     def volumes(self) -> dict[str, float]:
         """Return the volume that each body's surface encloses, m^3 (m^2 in 2D). Collective."""
+        return self._enclosed(self._mesh.points + self._exchange.with_shared(self.displacement))
+
+    def volume_ratios(self) -> dict[str, float]:
+        """Return by body how many times its volume at rest it encloses. Collective."""
+        rest = self._enclosed(self._mesh.points)
+        return {name: volume / rest[name] for name, volume in self.volumes().items()}
+
+    def _enclosed(self, x: np.ndarray) -> dict[str, float]:
+        """Return the volume of each body whose nodes are at x. Collective."""
         mesh = self._mesh
-        x = mesh.points + self._exchange.with_shared(self.displacement)
         for group in mesh.groups:
             if group.gradients is None and group.nodes.shape[1] > self.dim + 1:
                 x = beyond_middles(x, group.nodes, self.dim)
