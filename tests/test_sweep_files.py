@@ -239,3 +239,46 @@ def test_what_a_setting_is_taken_for_is_of_the_scene(setting, shape, meant):
         scene_from_dict(data)
     line = next(line for line in str(caught.value).splitlines() if setting.split("=")[0] in line)
     assert (f"did you mean {meant}?" in line) if meant else ("did you mean" not in line)
+
+
+# ---- what is named twice, or not at all -----------------------------------------------------------------------
+
+
+def test_a_folder_is_no_scene():
+    Path("s.toml").write_text('scene = "."\n')
+    with pytest.raises(InputError, match="scene: "):
+        plan_sweep(Path("s.toml"))
+
+
+def test_names_that_read_as_one_number_are_two_points():
+    text = """exclude = [{ a = "10" }]
+    [axis.a]
+    1_0 = { set = { "time.dt" = 0.1 } }
+    10 = { set = { "time.dt" = 0.05 } }
+    """
+    runs = planned(text).runs
+    assert [run.name for run in runs] == ["a-1_0"]
+    assert [run.name for run in select("a=1_0", runs)] == ["a-1_0"]
+
+
+def test_values_that_read_as_one_number_are_one_point():
+    text = """exclude = [{ dt = 5e-2 }]
+    [axis]
+    dt = { key = "time.dt", values = [0.1, 0.05] }
+    """
+    assert [run.axes["dt"] for run in planned(text).runs] == ["0.1"]
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("a.x = { options = { -fsi_ksp_rtol = 1e-3, fsi_ksp_rtol = 1e-4 } }", "stands there twice"),
+        ('a.ranks = ["2"]', "axis.a.ranks = \"2\": must be a whole number"),
+        ("a.ranks = [true]", "axis.a.ranks = true: must be a whole number"),
+        ('a = { key = "time.dt", values = { from = 0.1, step = 0.0, count = 3 } }', "0.1 stands there more than once"),
+        ('a = { key = "time.dt", values = [0.1, 0.1, 0.05, 0.05] }', "0.1, 0.05 stand there more than once"),
+    ],
+)  # fmt: skip
+def test_what_stands_twice_or_is_no_number_is_told_as_it_was_written(text, said):
+    lines = refused(f"[axis]\n{text}")
+    assert len(lines) == 1 and said in lines[0]

@@ -140,7 +140,7 @@ set.time: is a table; keys of a scene stand in quotes
 axis.solver.c.ranks = 0: must be a whole number
 axis.solver.c.colour: no such word of a point
 axis.solver.d: must be a table
-axis.dt.values: 0.05 stands there twice
+axis.dt.values: 0.05 stands there more than once
 axis.again.values: must have factor or step
 axis.again.values.count: must be a whole number
 axis.both: must have one of key, option and ranks, and has key and option

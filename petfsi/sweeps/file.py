@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.scene.dump import as_toml
 from petfsi.scene.raw import read_raw
-from petfsi.sweeps.names import point_text, same_point
+from petfsi.sweeps.names import point_text, points_meant
 from petfsi.sweeps.values import is_dated, read_values
 
 KEYS = ("scene", "set", "repeat", "steps", "axis", "exclude")
@@ -60,7 +61,9 @@ class SweepFile:
 
     Attributes
     ----------
-    path, scene : Path
+    path : Path
+    scene : Path or None
+        None if it is not named.
     text : bytes
         As given.
     sets : dict of str to str
@@ -74,7 +77,7 @@ class SweepFile:
 
     path: Path
     text: bytes
-    scene: Path
+    scene: Path | None
     sets: dict[str, str]
     repeat: int
     steps: int | None
@@ -83,10 +86,7 @@ class SweepFile:
 
     def excludes(self, points: Mapping[str, Point]) -> bool:
         """Return whether a combination of points is left out."""
-        return any(
-            all(any(same_point(points[axis].text, one) for one in wanted) for axis, wanted in rule.items())
-            for rule in self.excluded
-        )
+        return any(all(points[axis].text in wanted for axis, wanted in rule.items()) for rule in self.excluded)
 
 
 def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
@@ -113,7 +113,7 @@ def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
     return SweepFile(
         path=path,
         text=path.read_bytes(),
-        scene=path.parent / scene,
+        scene=path.parent / scene if scene else None,
         sets=_settings("set", data.get("set", {}), mistakes),
         repeat=_whole("repeat", data.get("repeat", 1), MOST_ROUNDS, mistakes) or 1,
         steps=_whole("steps", data["steps"], 2**53, mistakes) if "steps" in data else None,
@@ -183,8 +183,9 @@ def _points_by_value(key: str, axis: dict[str, Any], mistakes: list[str]) -> lis
     place = f"{key}.ranks" if what[0] == "ranks" else f"{key}.values"
     values = read_values(place, axis["ranks"] if what[0] == "ranks" else axis.get("values"), mistakes)
     texts = [point_text(value) for value in values]
-    for text in sorted({text for text in texts if texts.count(text) > 1}):
-        mistakes.append(f"{place}: {shown(text)} stands there twice")
+    twice = [text for text, count in Counter(texts).items() if count > 1]
+    if twice:
+        mistakes.append(f"{place}: {shown(', '.join(twice), 200)} stand{'s' * (len(twice) == 1)} there more than once")
     if what[0] == "ranks":
         counts = [_whole(place, value, MOST_RANKS, mistakes) for value in values]
         return [Point(text, ranks=count) for text, count in zip(texts, counts, strict=True)]
@@ -246,10 +247,11 @@ def _excluded(
                 if not isinstance(tables, dict) or axis not in tables:  # else what is wrong with it is told already
                     mistakes.append(f"exclude.{number}.{shown(axis)}: there is no such axis")
                 continue
-            for point in points:
-                if not any(same_point(one.text, point) for one in axes[axis]):
-                    right = False
-                    mistakes.append(f"exclude.{number}.{axis} = {shown(point)}: the axis has no such point")
+            meant = {point: points_meant([one.text for one in axes[axis]], point) for point in points}
+            for point in (point for point in points if not meant[point]):
+                right = False
+                mistakes.append(f"exclude.{number}.{axis} = {shown(point)}: the axis has no such point")
+            wanted[axis] = [text for texts in meant.values() for text in texts]
         found += [wanted] if right else []
     return found
 
@@ -284,6 +286,8 @@ def _options(key: str, given: Any, mistakes: list[str]) -> dict[str, str]:
             mistakes.append(f"{key}.{shown(name)}: an option's value is a number, a text, true or false")
         elif name.lstrip("-").lower() == "options_file":
             mistakes.append(f"{key}.{shown(name)}: options_file is a word of its own, beside options")
+        elif name.lstrip("-").lower() in found:
+            mistakes.append(f"{key}.{shown(name)}: stands there twice, in another spelling")
         else:
             found[name.lstrip("-").lower()] = point_text(value)
     return found
@@ -291,6 +295,7 @@ def _options(key: str, given: Any, mistakes: list[str]) -> dict[str, str]:
 
 def _whole(key: str, value: Any, most: int, mistakes: list[str]) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        mistakes.append(f"{key} = {shown(value)}: must be a whole number from 1 to {most:,}")
+        given = as_toml(value) if isinstance(value, str | bool) else value
+        mistakes.append(f"{key} = {shown(given)}: must be a whole number from 1 to {most:,}")
         return None
     return value

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from petfsi.scene.dump import as_toml
@@ -29,10 +29,12 @@ def point_text(value: Any) -> str:
     return as_toml(value)
 
 
-def same_point(text: str, wanted: str) -> bool:
-    """Return whether a point is meant: by its text, or as the same number or list, 1e-6 for 1e-06."""
-    if text == wanted:
-        return True
+def points_meant(texts: Collection[str], wanted: str) -> list[str]:
+    """Return which points of an axis are meant: the one of that text, else the same number or list, 1e-6 for 1e-06."""
+    return [wanted] if wanted in texts else [text for text in texts if _is_same_value(text, wanted)]
+
+
+def _is_same_value(text: str, wanted: str) -> bool:
     try:
         if text.startswith("[") and wanted.startswith("["):
             return bool(tomllib.loads(f"v = {text}")["v"] == tomllib.loads(f"v = {wanted}")["v"])

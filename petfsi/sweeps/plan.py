@@ -107,8 +107,8 @@ def plan_sweep(path: Path) -> Plan:
     mistakes: list[str] = []
     file = read_sweep_file(path, mistakes)
     planner = _Planner(file, mistakes)
-    if file.scene != path.parent:
-        planner.build()
+    if file.scene is not None:
+        planner.build(file.scene)
     if mistakes:
         told = list(dict.fromkeys(mistakes))
         count = "one mistake" if len(told) == 1 else f"{len(told)} mistakes"
@@ -124,20 +124,21 @@ class _Planner:
         axes = {name: [point.text for point in points] for name, points in file.axes.items()}
         self.plan = Plan(file.text, axes)
         self._base: dict[str, Any] = {}
+        self._directory = file.path.parent
         self._scenes: dict[str, tuple[str, dict[str, str]] | None] = {}
         self._options: dict[str, tuple[list[str], dict[str, str]] | None] = {}
         self._names: dict[tuple[str | int, ...], str] = {}
         self._twins: list[str] = []
 
-    def build(self) -> None:
-        """Fill the plan."""
+    def build(self, scene: Path) -> None:
+        """Fill the plan with runs of a scene's file."""
         file = self.file
         count = math.prod(len(points) for points in file.axes.values()) * file.repeat
         if count > MOST_RUNS:
             self.mistakes.append(f"axis: {count:,} combinations; a sweep has at most {MOST_RUNS:,} runs")
             return
         try:
-            self._base = read_raw(file.scene)
+            self._base, self._directory = read_raw(scene), scene.parent
         except InputError as error:
             self.mistakes.append(f"scene: {error}")
             return
@@ -185,7 +186,7 @@ class _Planner:
         data = copy.deepcopy(self._base)
         for key, value in sets.items():
             apply_set(data, f"{key}={value}")
-        scene = scene_from_dict(data, self.file.scene.parent)
+        scene = scene_from_dict(data, self._directory)
         names = self._copied(mesh_files(scene))
         text = dump_scene(scene, names)
         name = f"scene-{hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]}.toml"

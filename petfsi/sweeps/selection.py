@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.sweeps.folder import axes_of
-from petfsi.sweeps.names import same_point
+from petfsi.sweeps.names import points_meant
 from petfsi.sweeps.plan import Planned
 
 #: A bracket, or a comma.
@@ -41,9 +41,10 @@ def select(text: str, runs: Sequence[Planned]) -> list[Planned]:
         if not separator or axis not in axes:
             known = ", ".join(axes) or "none"
             raise InputError(f"--only {shown(part)}: must be axis=point, or the name of a run; axes are {known}")
-        if not any(same_point(one, point) for one in axes[axis]):
+        meant = points_meant(axes[axis], point)
+        if not meant:
             raise InputError(f"--only {shown(part)}: no such point; {axis} has {shown(', '.join(axes[axis]), 500)}")
-        rules.setdefault(axis, []).append(point)
+        rules.setdefault(axis, []).extend(meant)
     at = {run.name for run in runs if rules and _is_at(run, rules)}
     if rules and not at:
         raise InputError(f"--only {shown(text, 200)}: no run is at these points; they are excluded")
@@ -63,4 +64,4 @@ def _parts(text: str) -> list[str]:
 
 
 def _is_at(run: Planned, rules: dict[str, list[str]]) -> bool:
-    return all(any(same_point(run.axes[axis], one) for one in points) for axis, points in rules.items())
+    return all(run.axes[axis] in points for axis, points in rules.items())
