@@ -255,6 +255,7 @@ def sweep(ctx: click.Context, target: Path, **wanted: Any) -> NoReturn:
     def work() -> int:
         if launched_rank() > 0:
             return 0
+        from petfsi.runs.console import say  # which survives a reader who has left: runs are at work
         from petfsi.sweeps.command import Wanted
         from petfsi.sweeps.command import sweep as run_sweep
 

@@ -219,7 +219,14 @@ def test_words_of_a_start(place):
     Path(directory, ".petfsi-run").touch()
     assert launch.run_words(folder, run, -1) == [*begin, "--overwrite", "--steps", "7"]
     assert launch.run_words(folder, run, 3) == ["resume", directory, "--steps", "4"]
-    assert launch.launcher(3, cores=2) == ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", "3"]
+    assert launch.launcher(1) == [] and launch.launcher(3) == [
+        "mpirun",
+        "--bind-to",
+        "none",
+        "--oversubscribe",
+        "-n",
+        "3",
+    ]
     env = {"OMPI_COMM_WORLD_RANK": "0", "PMIX_RANK": "0", "OMPI_MCA_btl": "self", "PETSC_OPTIONS": "-x", "HOME": "/"}
     kept = {"OMPI_MCA_btl": "self", "HOME": "/", "OMP_NUM_THREADS": "1", "OMPI_MCA_odls_base_sigkill_timeout": "1"}
     assert launch.environment(env) == kept

@@ -14,7 +14,7 @@ from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.output import files
 from petfsi.sweeps import attempts
-from petfsi.sweeps.claim import claim, give_back
+from petfsi.sweeps.claim import claim, give_back, is_busy
 from petfsi.sweeps.folder import SweepFolder, describe_changed
 from petfsi.sweeps.plan import Plan, Planned, plan_sweep
 from petfsi.sweeps.pool import Pool
@@ -134,6 +134,10 @@ def _make(folder: SweepFolder, plan: Plan, wanted: Wanted, say: Callable[[str], 
     chosen = {run.name for run in _chosen(wanted, plan.runs)}
     if kept := [name for name in changed if name not in chosen]:
         raise InputError(f"{kept[0]} has changed, too: --retry changed takes no --only that leaves such runs out")
+    # before anything is written; one that another call begins from here on is told by the plan, which differs from it
+    for name in changed:
+        if is_busy(folder.run(name)):
+            raise InputError(_at_work(folder, name))
     folder.make(plan)
     for run in plan.runs:
         if run.name in changed:
@@ -146,11 +150,15 @@ def _make(folder: SweepFolder, plan: Plan, wanted: Wanted, say: Callable[[str], 
 def _set_aside(folder: SweepFolder, run: Planned, say: Callable[[str], None]) -> None:
     handle = claim(folder.run(run.name))
     if handle is None:
-        raise InputError(f"{folder.run(run.name)}: a process is at work in it; wait for it, or stop it")
+        raise InputError(_at_work(folder, run.name))
     try:
         say(f"{run.name} begins anew; what was there is in {folder.set_aside(run)}")
     finally:
         give_back(handle)
+
+
+def _at_work(folder: SweepFolder, name: str) -> str:
+    return f"{folder.run(name)}: a process is at work in it; wait for it, or stop it"
 
 
 def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, say: Callable[[str], None]) -> None:

@@ -38,6 +38,16 @@ class _Child:
     began: float
     told: bool = False
 
+    def send(self, number: int) -> None:
+        """Send it a signal; its number is its own until it is reaped, which ``Popen.send_signal`` would do first."""
+        with suppress(ProcessLookupError):
+            os.kill(self.process.pid, number)
+
+    def kill(self) -> None:
+        """End it and what it has started at once."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+
 
 class Pool:
     """Runs what has no result yet. ``work`` returns why it stopped before all had one, or nothing.
@@ -70,8 +80,9 @@ class Pool:
         with self._hearing():
             try:
                 self._loop()
-            finally:
-                self._end()
+            except BaseException:
+                self._wind_down()
+                raise
         if self.others and self.why:
             names = ", ".join(run.name for run in self.others[:5])
             self.say(f"at work already, and not stopped by this: {names}{' ...' * (len(self.others) > 5)}")
@@ -86,6 +97,16 @@ class Pool:
                 self._start()
             if not self.children and (self.why or not (self.waiting or self.others)):
                 return
+            time.sleep(POLL)
+
+    def _wind_down(self) -> None:
+        """Let what is at work end after its present step, whatever else cannot be done any more."""
+        with suppress(Exception):
+            self._stop("an error")
+        while self.children:
+            with suppress(Exception):  # of each that ends, once
+                self._reap()
+                self._heed()
             time.sleep(POLL)
 
     # ---- starting -----------------------------------------------------------------------------------------------
@@ -125,6 +146,11 @@ class Pool:
     def _begin(self, run: Planned, handle: int) -> _Child | None:
         """Start a run that is claimed; None if there is nothing to run, or no room."""
         path = self.folder.run(run.name)
+        now = self.folder.read_run(run.name)
+        if now is None or now.hash != run.hash:  # while it waited; what is here is that call's
+            self.say(f"{run.name}: was replaced by another call, and is left to that")
+            self.ended += 1
+            return None
         look = look_at(path, run, busy=False)
         if look.state in (*RESULTS, "lost", "refused"):
             self.ended += 1
@@ -133,7 +159,7 @@ class Pool:
             self._stop(self._no_room())
             return None
         attempts.began(path, "run" if look.step < 0 else "resume", look.step)
-        process = start(self.folder, run, look.step, self.cores, handle)
+        process = start(self.folder, run, look.step, handle)
         self.children.append(_Child(run, process, handle, look.step, time.monotonic()))
         return self.children[-1]
 
@@ -151,14 +177,19 @@ class Pool:
     def _reap(self) -> None:
         """Note which processes have ended, and how."""
         for child in list(self.children):
-            pid, status, usage = os.wait4(child.process.pid, os.WNOHANG)
-            if pid == 0:
-                continue
-            code = child.process.returncode = os.waitstatus_to_exitcode(status)
+            try:
+                pid, status, usage = os.wait4(child.process.pid, os.WNOHANG)
+            except ChildProcessError:  # where SIGCHLD is ignored the system keeps no exit code
+                code, peak_kb = 1, 0
+            else:
+                if pid == 0:
+                    continue
+                code, peak_kb = os.waitstatus_to_exitcode(status), usage.ru_maxrss
+            child.process.returncode = code
             self.children.remove(child)
             try:
                 with self._room():
-                    self._note(child, code, usage.ru_maxrss)
+                    self._note(child, code, peak_kb)
             finally:
                 give_back(child.claim)
 
@@ -190,28 +221,26 @@ class Pool:
         for child in self.children:
             if not child.told:
                 child.told = True
-                with suppress(ProcessLookupError):
-                    child.process.send_signal(signal.SIGUSR1)
+                child.send(signal.SIGUSR1)
         if self.children:
-            self.say(f"{len(self.children)} at work stop after their present steps; a second signal ends them at once")
+            another = "a second signal" if self._signals else "a signal"
+            self.say(f"{len(self.children)} at work stop after their present steps; {another} ends them at once")
 
     def _end(self) -> None:
         """End every process: mpirun is told to, as its ranks are not in its group."""
         for child in self.children:
             child.told = True
-            with suppress(ProcessLookupError):
-                if child.run.ranks > 1:
-                    child.process.terminate()
-                else:
-                    os.killpg(child.process.pid, signal.SIGKILL)
+            if child.run.ranks > 1:
+                child.send(signal.SIGTERM)
+            else:
+                child.kill()
         limit = time.monotonic() + PATIENCE
         while self.children and time.monotonic() < limit:
             with suppress(OSError):
                 self._reap()
             time.sleep(POLL)
         for child in self.children:
-            with suppress(ProcessLookupError):
-                os.killpg(child.process.pid, signal.SIGKILL)
+            child.kill()
         while self.children:
             with suppress(OSError):
                 self._reap()
