@@ -1,7 +1,9 @@
-"""What sweeps do when things go wrong beside them: signals, full disks, other calls, readers who leave. About 15 s."""
+"""What sweeps do when things go wrong beside them: signals, full disks, other calls, readers who leave. About 5 s."""
 
 import errno
+import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -12,10 +14,11 @@ import pytest
 from test_sweeps import SCENE, STUB, driver, starts, states, written
 
 from petfsi.errors import InputError
-from petfsi.sweeps import command, launch, pool
+from petfsi.sweeps import attempts, command, launch, pool
 from petfsi.sweeps.claim import claim, give_back
 from petfsi.sweeps.folder import SweepFolder
 from petfsi.sweeps.plan import plan_sweep
+from petfsi.sweeps.states import Look, last_words, look_at, said_so_far
 
 
 @pytest.fixture
@@ -106,7 +109,7 @@ def test_an_error_lets_runs_end_after_their_steps(place):
 
     with pytest.raises(OSError, match="terminal"):
         pool.Pool(folder, plan.runs, 2, say).work()
-    assert pool.look_at(wait.parent, plan.runs[1]).state == "stopped"
+    assert look_at(wait.parent, plan.runs[1]).state == "stopped"
 
 
 def test_a_reader_who_leaves_ends_nothing(place):
@@ -145,3 +148,167 @@ def test_all_runs_are_replaced_or_none(sweep):
     Path("out/runs/how-a/run.json").write_text(Path("out/runs/how-b/run.json").read_text().replace("0.3", "0.4"))
     with pytest.raises(InputError, match=r"how-a/run.json cannot be read"):
         folder.planned()
+
+
+# ---- claims -------------------------------------------------------------------------------------------------
+
+
+def handles():
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_a_run_that_is_put_aside_while_it_is_claimed_is_not_mine(tmp_path, monkeypatch):
+    run, before = tmp_path / "run", handles()
+    assert claim(run) is None  # between its going and its coming
+    run.mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "flock", lambda *_: run.rename(tmp_path / "aside").joinpath("../run").mkdir())
+        assert claim(run) is None
+    assert handles() == before
+
+
+def test_a_file_system_without_locks_has_sweeps(sweep, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOSYS, "no locks here")
+
+    file = written("fine")
+    monkeypatch.setattr(fcntl, "flock", flock)
+    assert sweep(file, "--out", "out").returncode == 0 and states() == {"how-fine": "done"}
+
+
+def test_a_disk_without_room_for_a_claim_stops_the_sweep(place, monkeypatch):
+    def full(path):
+        raise OSError(errno.ENOSPC, "full")
+
+    folder, plan = made("a")
+    monkeypatch.setattr(pool, "claim", full)
+    assert "are free on the disk" in pool.Pool(folder, plan.runs, 1, print).work()
+
+
+def test_a_run_whose_directory_has_gone_is_not_waited_for(place):
+    folder, plan = made("a")
+    shutil.rmtree(folder.run("how-a"))
+    said = []
+    assert pool.Pool(folder, plan.runs, 1, said.append).work() == "" and said[-1] == "how-a: its directory has gone"
+
+
+# ---- attempts and states ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "code, told, state",
+    [(75, False, "stopped"), (-9, True, "stopped"), (-9, False, "broken"), (1, False, "broken"), (3, False, "broken")],
+)
+def test_a_run_is_stopped_by_its_last_attempt_alone(tmp_path, place, code, told, state):
+    folder, plan = made("a")
+    path = folder.run("how-a")
+    (path / "summary.json").write_text('{"status": "stopped", "steps": 1, "reason": "SIGINT"}')
+    for _ in range(3):
+        attempts.began(path, "resume", 1, 0)
+        assert look_at(path, plan.runs[0]).state in ("stopped", state)
+        attempts.ended(path, code, 1.0, 0, told, 0)
+    assert look_at(path, plan.runs[0]).state == ("lost" if state == "broken" else state)
+
+
+@pytest.mark.parametrize("code", [-signal.SIGUSR1, 128 + signal.SIGUSR1])
+def test_a_run_that_is_stopped_while_it_starts_is_stopped(place, code):
+    folder, plan = made("a")
+    path = folder.run("how-a")
+    attempts.began(path, "run", -1, 0)
+    attempts.ended(path, code, 0.1, 0, True, 0)
+    look = look_at(path, plan.runs[0])
+    assert (look.state, look.reason) == ("stopped", "told to stop")
+
+
+FRAME = "-" * 74
+MPIRUN = (
+    f"{FRAME}\nPrimary job  terminated normally, but 1 process returned\n{FRAME}\n{FRAME}\nmpirun detected\n{FRAME}\n"
+)
+
+
+def test_the_last_words_are_those_of_the_last_attempt_and_of_petfsi(tmp_path):
+    (tmp_path / "output.txt").write_text("petfsi: the first\n")
+    attempts.began(tmp_path, "run", -1, said_so_far(tmp_path))
+    with open(tmp_path / "output.txt", "a") as file:
+        file.write("Killed\n")
+    assert last_words(tmp_path, attempts.read_attempts(tmp_path)) == "Killed"
+    with open(tmp_path / "output.txt", "a") as file:
+        file.write(f"petfsi: scene.toml: one mistake\n  time.dt: no\n{MPIRUN}")
+    assert last_words(tmp_path, attempts.read_attempts(tmp_path)) == "scene.toml: one mistake; time.dt: no"
+    (tmp_path / "output.txt").write_text(f"{FRAME}\nmpirun noticed that a process exited on signal 9\n{FRAME}\n")
+    assert last_words(tmp_path, []) == "mpirun noticed that a process exited on signal 9"
+
+
+def test_a_torn_line_swallows_no_other(tmp_path):
+    attempts.began(tmp_path, "run", -1, 0)
+    with open(tmp_path / "attempts.jsonl", "a") as file:
+        file.write('{"time": "20')
+    attempts.ended(tmp_path, 75, 1.0, 0, True, 0)
+    assert [attempt.exit for attempt in attempts.read_attempts(tmp_path)] == [75]
+
+
+def test_an_attempt_is_noted_as_what_it_is(place):
+    folder, plan = made("fine", text="steps = 5")
+    path = folder.run("how-fine")
+    (path / "checkpoint").mkdir()
+    (path / "checkpoint" / "000005.json").touch()  # all steps, and no summary: it begins anew
+    pool.Pool(folder, plan.runs, 1, print).work()
+    assert [attempt.how for attempt in attempts.read_attempts(path)] == ["run"] and starts() == {"how-fine run": 1}
+
+
+# ---- order, and what is said --------------------------------------------------------------------------------
+
+
+def test_a_round_of_repeat_is_not_overtaken_by_a_later_one(place, monkeypatch):
+    file = Path(written("l", "m", "n", repeat=3))
+    file.write_text(file.read_text() + "big = { ranks = 2 }\n")
+    folder, plan = SweepFolder(Path("out")), plan_sweep(file)
+    folder.make(plan)
+    order = []
+
+    def start(folder, run, *given):
+        order.append(run)
+        (folder.run(run.name) / "summary.json").write_text('{"status": "done"}')
+        return subprocess.Popen(["sleep", f"{0.02 * (1 + len(order) % 3)}"], start_new_session=True)
+
+    monkeypatch.setattr(pool, "start", start)
+    pool.Pool(folder, plan.runs, 2, print).work()
+    assert len(order) == 12 and [run.repeat for run in order] == sorted(run.repeat for run in order)
+
+
+def test_a_dry_run_says_what_is_run_again_and_words_without_effect_are_refused(sweep):
+    sweep(written("fine", "fails"), "--out", "out")
+    done = sweep("out", "--dry-run", "--retry", "failed")
+    assert "how-fails  failed, to be run again, 1 rank\n" in done.stdout and "how-fine  done, 1 rank\n" in done.stdout
+    done = sweep(written("fine", text=CHANGED), "--out", "out", "--dry-run", "--retry", "changed")
+    assert "how-fine  done, to be run again, 1 rank\n" in done.stdout
+    for words in (
+        ("--status", "--collect"),
+        ("--dry-run", "--status"),
+        ("--status", "--retry", "lost"),
+        ("--collect", "--only", "how=fine"),
+        ("--collect", "--jobs", "2"),
+    ):
+        done = sweep("out", *words)
+        assert done.returncode == 2 and "do not go together" in done.stderr, words
+
+
+def test_what_starts_nothing_needs_no_mpirun(sweep, monkeypatch):
+    folder, _ = made("fine", text="axis.ranks.ranks = [2]")
+    monkeypatch.setattr(command.shutil, "which", lambda name: None)
+    assert [
+        sweep(*words).returncode for words in (["s.toml", "--dry-run"], ["out", "--status"], ["out", "--collect"])
+    ] == [
+        0,
+        0,
+        0,
+    ]
+    done = sweep("out")
+    assert done.returncode == 2 and "there is no mpirun" in done.stderr
+
+
+def test_the_time_left_counts_ranks_and_cores():
+    looks = {"a": Look("done", "", 1, summary={"wall_s": 10.0}), "b": Look("new", "", -1), "c": Look("new", "", -1)}
+    for ranks, cores, seconds in ((1, 1, 20), (1, 2, 10), (1, 8, 10), (2, 2, 20), (4, 2, 20)):
+        left = command._time_left(looks, {"a": 1, "b": ranks, "c": ranks}, cores)
+        assert left.startswith(f"; about {seconds} s left here"), (ranks, cores, left)

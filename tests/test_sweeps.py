@@ -246,7 +246,7 @@ def made(place):
 
 def told(path, status, steps=1, kind="", code=None, starts=1):
     for _ in range(starts):
-        began(path, "run", -1)
+        began(path, "run", -1, 0)
     if code is not None:
         ended(path, code, 1.0, 0, False, 0)
     if status:
@@ -287,12 +287,12 @@ def test_a_claim_is_running_and_three_attempts_count_from_the_last_retry(made):
         assert look_at(path, run).state == "running"
     assert look_at(path, run).state == "lost"
     again(path, "lost")
-    began(path, "run", -1)
+    began(path, "run", -1, 0)
     assert look_at(path, run).state == "broken"
     (path / "checkpoint").mkdir()
     (path / "checkpoint" / "000002.json").touch()
     for _ in range(2):
-        began(path, "resume", 1)
+        began(path, "resume", 1, 0)
     assert look_at(path, run).state == "broken"  # it got further
 
 

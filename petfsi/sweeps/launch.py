@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from petfsi.output.files import RUN_MARKER
@@ -61,12 +61,12 @@ def environment(given: Mapping[str, str]) -> dict[str, str]:
     return {"OMP_NUM_THREADS": "1", **env, "OMPI_MCA_odls_base_sigkill_timeout": "1"}
 
 
-def start(folder: SweepFolder, run: Planned, step: int, claim: int) -> subprocess.Popen[bytes]:
-    """Start the process of a run, in a session of its own: Ctrl-C in a terminal reaches the sweep alone."""
-    words = [*launcher(run.ranks), *petfsi_words(), *run_words(folder, run, step)]
+def start(folder: SweepFolder, run: Planned, words: Sequence[str], claim: int) -> subprocess.Popen[bytes]:
+    """Start the process of a run with ``run_words``, in a session of its own: Ctrl-C reaches the sweep alone."""
+    line = [*launcher(run.ranks), *petfsi_words(), *words]
     with open(folder.run(run.name) / OUTPUT, "ab") as output:
         return subprocess.Popen(
-            words,
+            line,
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

@@ -16,9 +16,9 @@ from petfsi.runs.failure import NO_ROOM
 from petfsi.sweeps import attempts
 from petfsi.sweeps.claim import at_work, claim, give_back, is_busy, is_elsewhere
 from petfsi.sweeps.folder import SweepFolder
-from petfsi.sweeps.launch import start
+from petfsi.sweeps.launch import run_words, start
 from petfsi.sweeps.plan import Planned
-from petfsi.sweeps.states import RESULTS, Look, look_at
+from petfsi.sweeps.states import RESULTS, Look, look_at, said_so_far
 
 #: Bytes that must be free on the disk for a run to start.
 LEAST_ROOM = 100_000_000
@@ -52,7 +52,8 @@ class _Child:
 class Pool:
     """Runs what has no result yet. ``work`` returns why it stopped before all had one, or nothing.
 
-    Runs are taken in rounds of ``repeat``, those of many ranks first. What another process is at is waited for, and
+    Runs are taken in rounds of ``repeat``, those of many ranks first; while one waits for cores, smaller ones of its
+    round alone go before it. What another process is at is waited for, and
     what it leaves is taken over; its ranks count among those at work.
 
     Parameters
@@ -120,7 +121,9 @@ class Pool:
             if self.why or free < 1:
                 left += self.waiting[n:]
                 break
-            if run.ranks > free and free < self.cores:  # one of more ranks than cores waits until nothing is at work
+            if left and run.repeat > min(one.repeat for one in left):  # smaller ones overtake within their round
+                left.append(run)
+            elif run.ranks > free and free < self.cores:  # one of more ranks than cores waits until nothing is at work
                 left.append(run)
             else:
                 free -= self._take(run)
@@ -129,19 +132,20 @@ class Pool:
     def _take(self, run: Planned) -> int:
         """Start a run if it has no result and nobody is at it; return how many cores that takes."""
         path = self.folder.run(run.name)
-        handle = claim(path)
-        if handle is None:
-            self.say(f"{run.name}: {at_work(path) or 'another process has claimed it'}")
-            self.others.append(run)
-            return 0 if is_elsewhere(path) else run.ranks
-        child = None
-        try:
-            with self._room():
+        with self._room():  # the claim's file is one more
+            handle = claim(path)
+            if handle is None:
+                self.say(f"{run.name}: {at_work(path) or 'another process has claimed it'}")
+                self.others.append(run)
+                return 0 if is_elsewhere(path) else run.ranks
+            child = None
+            try:
                 child = self._begin(run, handle)
-        finally:
-            if child is None:
-                give_back(handle)
-        return 0 if child is None else run.ranks
+            finally:
+                if child is None:
+                    give_back(handle)
+            return 0 if child is None else run.ranks
+        return 0
 
     def _begin(self, run: Planned, handle: int) -> _Child | None:
         """Start a run that is claimed; None if there is nothing to run, or no room."""
@@ -158,8 +162,9 @@ class Pool:
         if shutil.disk_usage(path).free < LEAST_ROOM:
             self._stop(self._no_room())
             return None
-        attempts.began(path, "run" if look.step < 0 else "resume", look.step)
-        process = start(self.folder, run, look.step, handle)
+        words = run_words(self.folder, run, look.step)
+        attempts.began(path, words[0], look.step, said_so_far(path))
+        process = start(self.folder, run, words, handle)
         self.children.append(_Child(run, process, handle, look.step, time.monotonic()))
         return self.children[-1]
 
@@ -170,6 +175,10 @@ class Pool:
         self._looked = time.monotonic()
         left = [run for run in self.others if not is_busy(self.folder.run(run.name))]
         self.others = [run for run in self.others if run not in left]
+        for run in [run for run in left if not self.folder.run(run.name).is_dir()]:
+            left.remove(run)
+            self.ended += 1
+            self.say(f"{run.name}: its directory has gone")
         self.waiting = [*left, *self.waiting]
 
     # ---- ending -------------------------------------------------------------------------------------------------
