@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -148,6 +149,30 @@ def test_all_runs_are_replaced_or_none(sweep):
     Path("out/runs/how-a/run.json").write_text(Path("out/runs/how-b/run.json").read_text().replace("0.3", "0.4"))
     with pytest.raises(InputError, match=r"how-a/run.json cannot be read"):
         folder.planned()
+
+
+def test_a_run_of_unknown_settings_is_not_given_the_present_ones(place):
+    folder, plan = made("a")
+    path = folder.run("how-a") / "run.json"
+    path.write_text("{")
+    folder.make(plan)
+    assert folder.planned() == plan.runs  # nothing had begun
+    (path.parent / ".petfsi-run").touch()
+    path.write_text("{")
+    with pytest.raises(InputError, match=r"run.json cannot be read, and there are results"):
+        folder.make(plan)
+    assert path.read_text() == "{"
+
+
+def test_a_mesh_that_changes_meanwhile_is_not_copied_under_the_name_of_the_old_one(place):
+    Path("block.node").write_text("points")
+    Path("block.ele").write_text("cells")
+    Path("scene.toml").write_text(re.sub("shape = .*", 'shape = { mesh = "block.node" }', SCENE))
+    plan = plan_sweep(Path(written("a")))
+    Path("block.ele").write_text("other")
+    with pytest.raises(InputError, match=r"block.ele has changed while"):
+        SweepFolder(Path("out")).make(plan)
+    assert not list(Path("out").rglob("block.ele*")) and not Path("out/plan.csv").exists()
 
 
 # ---- claims -------------------------------------------------------------------------------------------------

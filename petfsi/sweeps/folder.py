@@ -7,7 +7,6 @@ import fcntl
 import io
 import json
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ import petfsi
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.output import files
+from petfsi.output.mesh_files import copy_mesh
 from petfsi.sweeps.plan import INPUTS, Plan, Planned
 
 #: Marks a folder as a sweep's.
@@ -158,23 +158,25 @@ class SweepFolder:
             self._make(plan)
 
     def _make(self, plan: Plan) -> None:
+        unknown = [run for run in plan.runs if self.read_run(run.name) is None]
+        for run in unknown:
+            if (self.run(run.name) / files.RUN_MARKER).exists():  # of other settings, it may be
+                raise InputError(
+                    f"{self.run(run.name) / RUN} cannot be read, and there are results beside it, whose settings it "
+                    f"told; put it back, or move {self.run(run.name)} away"
+                )
         marker = {"petfsi": petfsi.__version__, "format": FORMAT}
         if not self.is_sweep():
             files.replace_text(self.path / MARKER, json.dumps(marker) + "\n")
         self.inputs.mkdir(exist_ok=True)
-        for name, source in plan.meshes.items():
-            target = self.inputs / name
-            if not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                part = files.part_of(target)
-                shutil.copyfile(source, part)
-                os.replace(part, target)
+        for name, mesh in plan.meshes.items():
+            if not (self.inputs / name).exists():
+                copy_mesh(mesh, self.inputs / name)
         for name, data in plan.files.items():
             if not (self.inputs / name).exists():
                 _replace(self.inputs / name, data)
-        for run in plan.runs:
-            if self.read_run(run.name) is None:
-                self.prepare(run)
+        for run in unknown:
+            self.prepare(run)
         files.replace_text(self.path / "sweep.toml", plan.text)
         files.replace_text(self.plan, _plan_text(plan))
 
