@@ -241,7 +241,9 @@ def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoRet
     type=click.Choice(["failed", "lost", "refused", "changed"]),
     help="Run those of a state again: failed and changed ones from their start, and what was there is put aside.",
 )
-@click.option("--dry-run", is_flag=True, help="Check all and print the runs; write nothing.")
+@click.option(
+    "--dry-run", is_flag=True, help="Check all and print the runs, and which --retry begins again; write nothing."
+)
 @click.option("--status", is_flag=True, help="Print what became of the runs; start nothing.")
 @click.option("--collect", is_flag=True, help="Write runs.csv again; start nothing.")
 @click.pass_context
@@ -255,6 +257,7 @@ def sweep(ctx: click.Context, target: Path, **wanted: Any) -> NoReturn:
     def work() -> int:
         if launched_rank() > 0:
             return 0
+        from petfsi.runs.console import say  # which survives a reader who has left: runs are at work
         from petfsi.sweeps.command import Wanted
         from petfsi.sweeps.command import sweep as run_sweep
 

@@ -219,7 +219,14 @@ def test_words_of_a_start(place):
     Path(directory, ".petfsi-run").touch()
     assert launch.run_words(folder, run, -1) == [*begin, "--overwrite", "--steps", "7"]
     assert launch.run_words(folder, run, 3) == ["resume", directory, "--steps", "4"]
-    assert launch.launcher(3, cores=2) == ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", "3"]
+    assert launch.launcher(1) == [] and launch.launcher(3) == [
+        "mpirun",
+        "--bind-to",
+        "none",
+        "--oversubscribe",
+        "-n",
+        "3",
+    ]
     env = {"OMPI_COMM_WORLD_RANK": "0", "PMIX_RANK": "0", "OMPI_MCA_btl": "self", "PETSC_OPTIONS": "-x", "HOME": "/"}
     kept = {"OMPI_MCA_btl": "self", "HOME": "/", "OMP_NUM_THREADS": "1", "OMPI_MCA_odls_base_sigkill_timeout": "1"}
     assert launch.environment(env) == kept
@@ -239,7 +246,7 @@ def made(place):
 
 def told(path, status, steps=1, kind="", code=None, starts=1):
     for _ in range(starts):
-        began(path, "run", -1)
+        began(path, "run", -1, 0)
     if code is not None:
         ended(path, code, 1.0, 0, False, 0)
     if status:
@@ -280,12 +287,12 @@ def test_a_claim_is_running_and_three_attempts_count_from_the_last_retry(made):
         assert look_at(path, run).state == "running"
     assert look_at(path, run).state == "lost"
     again(path, "lost")
-    began(path, "run", -1)
+    began(path, "run", -1, 0)
     assert look_at(path, run).state == "broken"
     (path / "checkpoint").mkdir()
     (path / "checkpoint" / "000002.json").touch()
     for _ in range(2):
-        began(path, "resume", 1)
+        began(path, "resume", 1, 0)
     assert look_at(path, run).state == "broken"  # it got further
 
 

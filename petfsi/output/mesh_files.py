@@ -61,11 +61,16 @@ def copy_meshes(meshes: list[MeshFile], directory: Path) -> None:
         When one has changed since the scene was read.
     """
     for mesh in meshes:
-        path = directory / Path(mesh.mark.file).relative_to(DIRECTORY)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        files.replace_text(path, mesh.source.read_bytes())
-        if files.digest(path) != (mesh.mark.bytes, mesh.mark.blake2b):
-            raise InputError(f"mesh file {mesh.source} has changed while the scene was set up; run again")
+        copy_mesh(mesh, directory / Path(mesh.mark.file).relative_to(DIRECTORY))
+
+
+def copy_mesh(mesh: MeshFile, path: Path) -> None:
+    """Copy a mesh file; InputError, and no copy, when it has changed since the scene was read."""
+    data = mesh.source.read_bytes()
+    if (len(data), files.digest_of(data)) != (mesh.mark.bytes, mesh.mark.blake2b):
+        raise InputError(f"mesh file {mesh.source} has changed while the scene was set up; run again")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.replace_text(path, data)
 
 
 def own_names(meshes: list[MeshMark], directory: Path) -> dict[str, str]:

@@ -23,9 +23,11 @@ class Attempt:
     Attributes
     ----------
     step : int
-        Where it began: that of the newest checkpoint.
+        That of the newest checkpoint when it began.
     how : str
         ``run`` or ``resume``.
+    output : int
+        How many bytes earlier attempts have printed: its own words begin there.
     exit : int or None
         Its exit code, negative for the signal that ended it; None while it runs, or where whoever started it has gone.
     told : bool
@@ -36,6 +38,7 @@ class Attempt:
 
     step: int
     how: str
+    output: int = 0
     exit: int | None = None
     told: bool = False
     peak_kb: int = 0
@@ -54,7 +57,7 @@ def read_attempts(path: Path) -> list[Attempt]:
             if "retry" in entry:
                 found.clear()
             elif "how" in entry:
-                found.append(Attempt(int(entry["step"]), str(entry["how"])))
+                found.append(Attempt(int(entry["step"]), str(entry["how"]), int(entry.get("output", 0))))
             elif found:
                 found[-1].exit, found[-1].told = int(entry["exit"]), bool(entry["told"])
                 found[-1].peak_kb = int(entry["peak_kb"])
@@ -63,9 +66,10 @@ def read_attempts(path: Path) -> list[Attempt]:
     return found
 
 
-def began(path: Path, how: str, step: int) -> None:
-    """Note that an attempt begins."""
-    _append(path, {"time": _now(), "host": socket.gethostname(), "driver": os.getpid(), "how": how, "step": step})
+def began(path: Path, how: str, step: int, output: int) -> None:
+    """Note that an attempt begins, with the newest checkpoint's step and the bytes of output that are there."""
+    who = {"host": socket.gethostname(), "driver": os.getpid()}
+    _append(path, {"time": _now(), **who, "how": how, "step": step, "output": output})
 
 
 def ended(path: Path, code: int, seconds: float, gained: int, told: bool, peak_kb: int) -> None:
@@ -84,9 +88,12 @@ def _now() -> str:
 
 
 def _append(path: Path, entry: dict[str, Any]) -> None:
-    handle = os.open(path / NAME, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    handle = os.open(path / NAME, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     try:
         data = (json.dumps(entry) + "\n").encode()
+        size = os.fstat(handle).st_size
+        if size and os.pread(handle, 1, size - 1) != b"\n":  # a torn line would swallow this one
+            data = b"\n" + data
         if os.write(handle, data) != len(data):
             raise OSError(28, os.strerror(28), str(path / NAME))
     finally:

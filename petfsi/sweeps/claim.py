@@ -6,6 +6,7 @@ has ended, however that was. Once a run is under way its directory has a lock be
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import time
@@ -21,25 +22,51 @@ _TRIES = 5
 
 
 def claim(path: Path) -> int | None:
-    """Return the handle of a run's claim; None where it is another's, or a process is at work in it."""
-    handle = os.open(path / NAME, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-    for _ in range(_TRIES):
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            time.sleep(0.005)
-            continue
-        # a run that is put aside has taken its claim along
-        if os.path.samestat(os.fstat(handle), os.stat(path / NAME)) and not at_work(path):
+    """Return the handle of a run's claim; None where it is another's, or a process is at work in it.
+
+    None, too, where its directory is just being put aside, or has gone. Where the file system knows no ``flock`` the
+    directory's lock alone keeps two processes apart.
+    """
+    try:
+        handle = os.open(path / NAME, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    except FileNotFoundError:
+        return None
+    try:
+        if _is_ours(path, handle):
             return handle
-        break
+    except BaseException:
+        os.close(handle)
+        raise
     os.close(handle)
     return None
 
 
+def _is_ours(path: Path, handle: int) -> bool:
+    for _ in range(_TRIES):
+        if _flock(handle, fcntl.LOCK_EX) is not False:
+            break
+        time.sleep(0.005)
+    else:
+        return False
+    try:  # a run that is put aside has taken its claim along
+        same = os.path.samestat(os.fstat(handle), os.stat(path / NAME))
+    except FileNotFoundError:
+        return False
+    return same and not at_work(path)
+
+
+def _flock(handle: int, kind: int) -> bool | None:
+    """Return whether this process now holds the file; None where the file system cannot tell."""
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    except OSError as error:
+        return False if error.errno in (errno.EACCES, errno.EAGAIN) else None
+    return True
+
+
 def give_back(handle: int) -> None:
     """Give a claim back, also for those who have inherited it: MPI's daemon outlives its process by a moment."""
-    fcntl.flock(handle, fcntl.LOCK_UN)
+    _flock(handle, fcntl.LOCK_UN)
     os.close(handle)
 
 
@@ -49,13 +76,9 @@ def is_busy(path: Path) -> bool:
         handle = os.open(path / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:
         return bool(at_work(path))
-    try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(handle)
-    return bool(at_work(path))
+    claimed = _flock(handle, fcntl.LOCK_SH) is False
+    os.close(handle)
+    return claimed or bool(at_work(path))
 
 
 def is_elsewhere(path: Path) -> bool:

@@ -8,22 +8,20 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.output import files
 from petfsi.sweeps import attempts
-from petfsi.sweeps.claim import claim, give_back
+from petfsi.sweeps.claim import claim, give_back, is_busy
 from petfsi.sweeps.folder import SweepFolder, describe_changed
 from petfsi.sweeps.plan import Plan, Planned, plan_sweep
 from petfsi.sweeps.pool import Pool
 from petfsi.sweeps.selection import select
-from petfsi.sweeps.states import RESULTS, STATES, look_at
+from petfsi.sweeps.states import RESULTS, STATES, Look, look_at
 from petfsi.sweeps.table import collect
 
 DONE, LEFT, INTERRUPTED = 0, 1, 75
-RETRY = ("failed", "lost", "refused", "changed")
 #: Runs that are named in what is said at the end.
 _TOLD = 10
 
@@ -43,7 +41,7 @@ class Wanted:
     only : str
         ``axis=point,...``, or names of runs; empty for all.
     retry : str or None
-        One of ``RETRY``.
+        ``failed``, ``lost``, ``refused`` or ``changed``.
     dry_run, status, collect : bool
         To do nothing but say what would be done, what is, or write the table.
     """
@@ -66,28 +64,30 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
     InputError
         With every mistake in the file, or what of the folder does not fit it; nothing has been written then.
     """
+    _check_words(wanted)
     folder, plan = _open(wanted)
     runs = folder.planned() if plan is None else plan.runs
     chosen = _chosen(wanted, runs)
-    _check_launcher(chosen)
+    cores = wanted.jobs or len(os.sched_getaffinity(0))
     if wanted.dry_run:
-        _say_plan(folder, chosen, say)
+        _say_plan(folder, chosen, _renewed(folder, plan, chosen, wanted.retry), say)
         return DONE
     if wanted.status:
-        return _say_states(folder, runs, chosen, say, whole=True)
+        return _say_states(folder, runs, chosen, cores, say, whole=True)
+    if not wanted.collect:
+        _check_launcher(chosen)
     if plan is not None:
         _make(folder, plan, wanted, say)
     if wanted.collect:
         rows = collect(folder, runs)
         say(f"{folder.table}: {len(rows)} runs")
         return DONE
-    if wanted.retry in ("failed", "lost", "refused"):
+    if wanted.retry and wanted.retry != "changed":
         _retry(folder, chosen, wanted.retry, say)
     if os.environ.get("PETSC_OPTIONS"):
         say("PETSC_OPTIONS is set, and not read: what a run hangs on stands in the sweep's file")
-    cores = wanted.jobs or len(os.sched_getaffinity(0))
     why = Pool(folder, chosen, cores, say).work()
-    _say_states(folder, runs, chosen, say)
+    _say_states(folder, runs, chosen, cores, say)
     try:
         collect(folder, runs)
         say(f"{folder.table}: a row for each; again with: petfsi sweep {folder.path} --collect")
@@ -97,6 +97,15 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
         say(f"stopped by {why}; go on with: petfsi sweep {folder.path}")
         return INTERRUPTED
     return _code(folder, chosen)
+
+
+def _check_words(wanted: Wanted) -> None:
+    """Raise InputError of words that would be without effect beside each other."""
+    only = [name for name in ("dry_run", "status", "collect") if getattr(wanted, name)]
+    unheard = {"status": ["retry"], "collect": ["retry", "only", "jobs"]}
+    for name in only[:1]:
+        for other in only[1:] or [word for word in unheard.get(name, []) if getattr(wanted, word)]:
+            raise InputError(f"--{name.replace('_', '-')} and --{other} do not go together; give one of them")
 
 
 def _open(wanted: Wanted) -> tuple[SweepFolder, Plan | None]:
@@ -134,6 +143,10 @@ def _make(folder: SweepFolder, plan: Plan, wanted: Wanted, say: Callable[[str], 
     chosen = {run.name for run in _chosen(wanted, plan.runs)}
     if kept := [name for name in changed if name not in chosen]:
         raise InputError(f"{kept[0]} has changed, too: --retry changed takes no --only that leaves such runs out")
+    # before anything is written; one that another call begins from here on is told by the plan, which differs from it
+    for name in changed:
+        if is_busy(folder.run(name)):
+            raise InputError(_at_work(folder, name))
     folder.make(plan)
     for run in plan.runs:
         if run.name in changed:
@@ -146,11 +159,15 @@ def _make(folder: SweepFolder, plan: Plan, wanted: Wanted, say: Callable[[str], 
 def _set_aside(folder: SweepFolder, run: Planned, say: Callable[[str], None]) -> None:
     handle = claim(folder.run(run.name))
     if handle is None:
-        raise InputError(f"{folder.run(run.name)}: a process is at work in it; wait for it, or stop it")
+        raise InputError(_at_work(folder, run.name))
     try:
         say(f"{run.name} begins anew; what was there is in {folder.set_aside(run)}")
     finally:
         give_back(handle)
+
+
+def _at_work(folder: SweepFolder, name: str) -> str:
+    return f"{folder.run(name)}: a process is at work in it; wait for it, or stop it"
 
 
 def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, say: Callable[[str], None]) -> None:
@@ -163,6 +180,13 @@ def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, say: Call
             _set_aside(folder, run, say)
         else:
             attempts.again(path, state)
+
+
+def _renewed(folder: SweepFolder, plan: Plan | None, chosen: Sequence[Planned], retry: str | None) -> set[str]:
+    """Return the names of runs that ``--retry`` lets begin again."""
+    if retry == "changed":
+        return set() if plan is None else set(folder.changed(plan))
+    return {run.name for run in chosen if retry and look_at(folder.run(run.name), run).state == retry}
 
 
 def _chosen(wanted: Wanted, runs: Sequence[Planned]) -> list[Planned]:
@@ -186,13 +210,14 @@ def _code(folder: SweepFolder, chosen: Sequence[Planned]) -> int:
 # ---- what is said -------------------------------------------------------------------------------------------
 
 
-def _say_plan(folder: SweepFolder, chosen: Sequence[Planned], say: Callable[[str], None]) -> None:
+def _say_plan(folder: SweepFolder, chosen: Sequence[Planned], renewed: set[str], say: Callable[[str], None]) -> None:
     """Say what would be run, without making anything."""
     states: Counter[str] = Counter()
     for run in chosen:
         state = look_at(folder.run(run.name), run).state if folder.run(run.name).is_dir() else "new"
         states[state] += 1
-        say(f"{run.name}  {state}, {run.ranks} rank{'s' * (run.ranks > 1)}")
+        anew = ", to be run again" * (run.name in renewed)
+        say(f"{run.name}  {state}{anew}, {run.ranks} rank{'s' * (run.ranks > 1)}")
     say(f"{len(chosen)} runs in {folder.path}: {_counts(states)}; nothing was written")
 
 
@@ -200,6 +225,7 @@ def _say_states(
     folder: SweepFolder,
     runs: Sequence[Planned],
     chosen: Sequence[Planned],
+    cores: int,
     say: Callable[[str], None],
     whole: bool = False,
 ) -> int:
@@ -216,8 +242,9 @@ def _say_states(
         if len(named) > most and state not in ("new", "running"):
             say(f"and {len(named) - most} more {state}")
     counts = Counter(look.state for look in looks.values())
+    ranks = {run.name: run.ranks for run in chosen}
     rest = "" if len(chosen) == len(runs) else f" of {len(runs)}"
-    say(f"{len(chosen)}{rest} runs: {_counts(counts)}{_time_left(looks)}")
+    say(f"{len(chosen)}{rest} runs: {_counts(counts)}{_time_left(looks, ranks, cores)}")
     return DONE
 
 
@@ -225,12 +252,13 @@ def _counts(states: Counter[str]) -> str:
     return ", ".join(f"{states[state]} {state}" for state in STATES if states[state]) or "none"
 
 
-def _time_left(looks: dict[str, Any]) -> str:
-    """Return how long what is left may take, if it is like what has ended."""
+def _time_left(looks: dict[str, Look], ranks: dict[str, int], cores: int) -> str:
+    """Return how long what is left may take on so many cores, if it is like what has ended."""
     known = [float(one.summary["wall_s"]) for one in looks.values() if one.state == "done" and "wall_s" in one.summary]
-    left = sum(look.state not in (*RESULTS, "lost", "refused") for look in looks.values())
+    unfinished = [name for name, look in looks.items() if look.state not in (*RESULTS, "lost", "refused")]
+    left = sum(min(ranks[name], cores) for name in unfinished)  # one of more ranks than cores has all of these
     if not known or not left:
         return ""
     each = sum(known) / len(known)
     spread = f"{min(known):.3g} to {max(known):.3g} s a run"
-    return f"; about {left * each / len(os.sched_getaffinity(0)):.3g} s left here ({spread})"
+    return f"; about {each * max(1, left / cores):.3g} s left here ({spread})"

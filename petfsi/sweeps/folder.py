@@ -7,7 +7,6 @@ import fcntl
 import io
 import json
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ import petfsi
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.output import files
+from petfsi.output.mesh_files import copy_mesh
 from petfsi.sweeps.plan import INPUTS, Plan, Planned
 
 #: Marks a folder as a sweep's.
@@ -93,27 +93,33 @@ class SweepFolder:
         Raises
         ------
         InputError
-            If it was not written whole, or a run's ``run.json`` has gone.
+            If it was not written whole, a run's ``run.json`` has gone, or a run is not the one of the plan.
         """
         if not self.plan.is_file():
             raise InputError(f"{self.path} was not made whole; once more: petfsi sweep SWEEP.toml --out {self.path}")
         with open(self.plan, encoding="utf-8", newline="") as file:
-            names = [row["name"] for row in csv.DictReader(file)]
-        found = [self.read_run(name) for name in names]
-        missing = [name for name, run in zip(names, found, strict=True) if run is None]
-        if missing:
-            raise InputError(
-                f"{self.run(missing[0]) / RUN} cannot be read; it is written anew by: petfsi sweep SWEEP.toml "
-                f"--out {self.path}"
-            )
-        return [run for run in found if run is not None]
+            hashes = {str(row.get("name")): row.get("hash") for row in csv.DictReader(file)}
+        again = f"petfsi sweep SWEEP.toml --out {self.path}"
+        found = []
+        for name, wanted in hashes.items():
+            run = self.read_run(name)
+            if run is None:
+                raise InputError(f"{self.run(name) / RUN} cannot be read; it is written anew by: {again}")
+            if run.hash != wanted:
+                raise InputError(
+                    f"{self.run(name)} has other settings than {self.plan} says: a call that was to replace runs was "
+                    f"cut short, or is at work; once it has gone: {again} --retry changed"
+                )
+            found.append(run)
+        return found
 
     def read_run(self, name: str) -> Planned | None:
-        """Return what a run's directory says that it is; None if it does not."""
+        """Return what a run's directory says that it is; None if it does not, or its hash is another's."""
         try:
             data = json.loads(files.read_small(self.run(name) / RUN, _MOST))
-            data.pop("hash")
-            return Planned(**data)
+            told = data.pop("hash")
+            run = Planned(**data)
+            return run if run.hash == told else None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
 
@@ -152,23 +158,25 @@ class SweepFolder:
             self._make(plan)
 
     def _make(self, plan: Plan) -> None:
+        unknown = [run for run in plan.runs if self.read_run(run.name) is None]
+        for run in unknown:
+            if (self.run(run.name) / files.RUN_MARKER).exists():  # of other settings, it may be
+                raise InputError(
+                    f"{self.run(run.name) / RUN} cannot be read, and there are results beside it, whose settings it "
+                    f"told; put it back, or move {self.run(run.name)} away"
+                )
         marker = {"petfsi": petfsi.__version__, "format": FORMAT}
         if not self.is_sweep():
             files.replace_text(self.path / MARKER, json.dumps(marker) + "\n")
         self.inputs.mkdir(exist_ok=True)
-        for name, source in plan.meshes.items():
-            target = self.inputs / name
-            if not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                part = files.part_of(target)
-                shutil.copyfile(source, part)
-                os.replace(part, target)
+        for name, mesh in plan.meshes.items():
+            if not (self.inputs / name).exists():
+                copy_mesh(mesh, self.inputs / name)
         for name, data in plan.files.items():
             if not (self.inputs / name).exists():
                 _replace(self.inputs / name, data)
-        for run in plan.runs:
-            if self.read_run(run.name) is None:
-                self.prepare(run)
+        for run in unknown:
+            self.prepare(run)
         files.replace_text(self.path / "sweep.toml", plan.text)
         files.replace_text(self.plan, _plan_text(plan))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from petfsi.output.files import RUN_MARKER
@@ -37,14 +37,15 @@ def run_words(folder: SweepFolder, run: Planned, step: int) -> list[str]:
     return ["run", os.path.abspath(folder.path / run.scene), "--out", directory, *again, *steps, *run.options]
 
 
-def launcher(ranks: int, cores: int) -> list[str]:
+def launcher(ranks: int) -> list[str]:
     """Return the words before those of petfsi.
 
-    Ranks are bound to no core: two mpiruns would each begin with the first one.
+    Ranks are bound to no core: two mpiruns would each begin with the first one. How many there may be is the sweep's
+    to say: mpirun would refuse more than its slots, which are physical cores.
     """
     if ranks == 1:
         return []
-    return ["mpirun", "--bind-to", "none", *(["--oversubscribe"] if ranks > cores else []), "-n", str(ranks)]
+    return ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", str(ranks)]
 
 
 def environment(given: Mapping[str, str]) -> dict[str, str]:
@@ -60,12 +61,12 @@ def environment(given: Mapping[str, str]) -> dict[str, str]:
     return {"OMP_NUM_THREADS": "1", **env, "OMPI_MCA_odls_base_sigkill_timeout": "1"}
 
 
-def start(folder: SweepFolder, run: Planned, step: int, cores: int, claim: int) -> subprocess.Popen[bytes]:
-    """Start the process of a run, in a session of its own: Ctrl-C in a terminal reaches the sweep alone."""
-    words = [*launcher(run.ranks, cores), *petfsi_words(), *run_words(folder, run, step)]
+def start(folder: SweepFolder, run: Planned, words: Sequence[str], claim: int) -> subprocess.Popen[bytes]:
+    """Start the process of a run with ``run_words``, in a session of its own: Ctrl-C reaches the sweep alone."""
+    line = [*launcher(run.ranks), *petfsi_words(), *words]
     with open(folder.run(run.name) / OUTPUT, "ab") as output:
         return subprocess.Popen(
-            words,
+            line,
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

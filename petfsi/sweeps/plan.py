@@ -85,15 +85,15 @@ class Plan:
         In the file's order, rounds of ``repeat`` outermost.
     files : dict of str to bytes
         By name in ``INPUTS``: scenes and options files.
-    meshes : dict of str to Path
-        By name in ``INPUTS``: mesh files, and where they are now.
+    meshes : dict of str to MeshFile
+        By name in ``INPUTS``: mesh files, where they are now and what they were when the scene was read.
     """
 
     text: bytes
     axes: dict[str, list[str]]
     runs: list[Planned] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
-    meshes: dict[str, Path] = field(default_factory=dict)
+    meshes: dict[str, MeshFile] = field(default_factory=dict)
 
 
 def plan_sweep(path: Path) -> Plan:
@@ -204,7 +204,7 @@ class _Planner:
             folder = f"meshes/{hashlib.sha256(digests.encode()).hexdigest()[:_DIGITS]}"
             for mesh in together:
                 names[os.path.abspath(mesh.source)] = f"{folder}/{mesh.source.name}"
-                self.plan.meshes[f"{folder}/{mesh.source.name}"] = mesh.source
+                self.plan.meshes[f"{folder}/{mesh.source.name}"] = mesh
         return names
 
     def _chosen(self, points: Mapping[str, Point], name: str) -> tuple[list[str], dict[str, str]] | None:

@@ -16,9 +16,9 @@ from petfsi.runs.failure import NO_ROOM
 from petfsi.sweeps import attempts
 from petfsi.sweeps.claim import at_work, claim, give_back, is_busy, is_elsewhere
 from petfsi.sweeps.folder import SweepFolder
-from petfsi.sweeps.launch import start
+from petfsi.sweeps.launch import run_words, start
 from petfsi.sweeps.plan import Planned
-from petfsi.sweeps.states import RESULTS, Look, look_at
+from petfsi.sweeps.states import RESULTS, Look, look_at, said_so_far
 
 #: Bytes that must be free on the disk for a run to start.
 LEAST_ROOM = 100_000_000
@@ -38,11 +38,22 @@ class _Child:
     began: float
     told: bool = False
 
+    def send(self, number: int) -> None:
+        """Send it a signal; its number is its own until it is reaped, which ``Popen.send_signal`` would do first."""
+        with suppress(ProcessLookupError):
+            os.kill(self.process.pid, number)
+
+    def kill(self) -> None:
+        """End it and what it has started at once."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+
 
 class Pool:
     """Runs what has no result yet. ``work`` returns why it stopped before all had one, or nothing.
 
-    Runs are taken in rounds of ``repeat``, those of many ranks first. What another process is at is waited for, and
+    Runs are taken in rounds of ``repeat``, those of many ranks first; while one waits for cores, smaller ones of its
+    round alone go before it. What another process is at is waited for, and
     what it leaves is taken over; its ranks count among those at work.
 
     Parameters
@@ -70,8 +81,9 @@ class Pool:
         with self._hearing():
             try:
                 self._loop()
-            finally:
-                self._end()
+            except BaseException:
+                self._wind_down()
+                raise
         if self.others and self.why:
             names = ", ".join(run.name for run in self.others[:5])
             self.say(f"at work already, and not stopped by this: {names}{' ...' * (len(self.others) > 5)}")
@@ -88,6 +100,16 @@ class Pool:
                 return
             time.sleep(POLL)
 
+    def _wind_down(self) -> None:
+        """Let what is at work end after its present step, whatever else cannot be done any more."""
+        with suppress(Exception):
+            self._stop("an error")
+        while self.children:
+            with suppress(Exception):  # of each that ends, once
+                self._reap()
+                self._heed()
+            time.sleep(POLL)
+
     # ---- starting -----------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
@@ -99,7 +121,9 @@ class Pool:
             if self.why or free < 1:
                 left += self.waiting[n:]
                 break
-            if run.ranks > free and free < self.cores:  # one of more ranks than cores waits until nothing is at work
+            if left and run.repeat > min(one.repeat for one in left):  # smaller ones overtake within their round
+                left.append(run)
+            elif run.ranks > free and free < self.cores:  # one of more ranks than cores waits until nothing is at work
                 left.append(run)
             else:
                 free -= self._take(run)
@@ -108,23 +132,29 @@ class Pool:
     def _take(self, run: Planned) -> int:
         """Start a run if it has no result and nobody is at it; return how many cores that takes."""
         path = self.folder.run(run.name)
-        handle = claim(path)
-        if handle is None:
-            self.say(f"{run.name}: {at_work(path) or 'another process has claimed it'}")
-            self.others.append(run)
-            return 0 if is_elsewhere(path) else run.ranks
-        child = None
-        try:
-            with self._room():
+        with self._room():  # the claim's file is one more
+            handle = claim(path)
+            if handle is None:
+                self.say(f"{run.name}: {at_work(path) or 'another process has claimed it'}")
+                self.others.append(run)
+                return 0 if is_elsewhere(path) else run.ranks
+            child = None
+            try:
                 child = self._begin(run, handle)
-        finally:
-            if child is None:
-                give_back(handle)
-        return 0 if child is None else run.ranks
+            finally:
+                if child is None:
+                    give_back(handle)
+            return 0 if child is None else run.ranks
+        return 0
 
     def _begin(self, run: Planned, handle: int) -> _Child | None:
         """Start a run that is claimed; None if there is nothing to run, or no room."""
         path = self.folder.run(run.name)
+        now = self.folder.read_run(run.name)
+        if now is None or now.hash != run.hash:  # while it waited; what is here is that call's
+            self.say(f"{run.name}: was replaced by another call, and is left to that")
+            self.ended += 1
+            return None
         look = look_at(path, run, busy=False)
         if look.state in (*RESULTS, "lost", "refused"):
             self.ended += 1
@@ -132,8 +162,9 @@ class Pool:
         if shutil.disk_usage(path).free < LEAST_ROOM:
             self._stop(self._no_room())
             return None
-        attempts.began(path, "run" if look.step < 0 else "resume", look.step)
-        process = start(self.folder, run, look.step, self.cores, handle)
+        words = run_words(self.folder, run, look.step)
+        attempts.began(path, words[0], look.step, said_so_far(path))
+        process = start(self.folder, run, words, handle)
         self.children.append(_Child(run, process, handle, look.step, time.monotonic()))
         return self.children[-1]
 
@@ -144,6 +175,10 @@ class Pool:
         self._looked = time.monotonic()
         left = [run for run in self.others if not is_busy(self.folder.run(run.name))]
         self.others = [run for run in self.others if run not in left]
+        for run in [run for run in left if not self.folder.run(run.name).is_dir()]:
+            left.remove(run)
+            self.ended += 1
+            self.say(f"{run.name}: its directory has gone")
         self.waiting = [*left, *self.waiting]
 
     # ---- ending -------------------------------------------------------------------------------------------------
@@ -151,14 +186,19 @@ class Pool:
     def _reap(self) -> None:
         """Note which processes have ended, and how."""
         for child in list(self.children):
-            pid, status, usage = os.wait4(child.process.pid, os.WNOHANG)
-            if pid == 0:
-                continue
-            code = child.process.returncode = os.waitstatus_to_exitcode(status)
+            try:
+                pid, status, usage = os.wait4(child.process.pid, os.WNOHANG)
+            except ChildProcessError:  # where SIGCHLD is ignored the system keeps no exit code
+                code, peak_kb = 1, 0
+            else:
+                if pid == 0:
+                    continue
+                code, peak_kb = os.waitstatus_to_exitcode(status), usage.ru_maxrss
+            child.process.returncode = code
             self.children.remove(child)
             try:
                 with self._room():
-                    self._note(child, code, usage.ru_maxrss)
+                    self._note(child, code, peak_kb)
             finally:
                 give_back(child.claim)
 
@@ -190,28 +230,26 @@ class Pool:
         for child in self.children:
             if not child.told:
                 child.told = True
-                with suppress(ProcessLookupError):
-                    child.process.send_signal(signal.SIGUSR1)
+                child.send(signal.SIGUSR1)
         if self.children:
-            self.say(f"{len(self.children)} at work stop after their present steps; a second signal ends them at once")
+            another = "a second signal" if self._signals else "a signal"
+            self.say(f"{len(self.children)} at work stop after their present steps; {another} ends them at once")
 
     def _end(self) -> None:
         """End every process: mpirun is told to, as its ranks are not in its group."""
         for child in self.children:
             child.told = True
-            with suppress(ProcessLookupError):
-                if child.run.ranks > 1:
-                    child.process.terminate()
-                else:
-                    os.killpg(child.process.pid, signal.SIGKILL)
+            if child.run.ranks > 1:
+                child.send(signal.SIGTERM)
+            else:
+                child.kill()
         limit = time.monotonic() + PATIENCE
         while self.children and time.monotonic() < limit:
             with suppress(OSError):
                 self._reap()
             time.sleep(POLL)
         for child in self.children:
-            with suppress(ProcessLookupError):
-                os.killpg(child.process.pid, signal.SIGKILL)
+            child.kill()
         while self.children:
             with suppress(OSError):
                 self._reap()

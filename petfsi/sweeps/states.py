@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,11 @@ STATES = ("done", "failed", "running", "new", "stopped", "broken", "lost", "refu
 RESULTS = ("done", "failed")
 #: So many attempts without a step gained are enough.
 MOST_ATTEMPTS = 3
-REFUSED, FAILED = 2, 3
+REFUSED, FAILED, STOPPED = 2, 3, 75
+#: What is told to stop before it can hear that ends so, or its mpirun does.
+_UNHEARD = (-signal.SIGUSR1, 128 + signal.SIGUSR1)
+#: Bytes at the end of the output in which its last message is looked for.
+_WORDS = 4000
 
 
 @dataclass
@@ -94,32 +100,53 @@ def _ended(path: Path, run: Planned, summary: dict[str, Any], kind: str, attempt
     if status == "failed" and kind not in NO_RESULT:
         return "failed", reason
     if last == REFUSED:
-        return "refused", last_words(path)
+        return "refused", last_words(path, attempts)
     if status == "failed":
         return "broken", f"{kind}: {reason}"
-    if status == "stopped":
+    told = bool(attempts) and attempts[-1].told
+    if told and last in _UNHEARD:  # while it started, before it could hear
+        return "stopped", "told to stop"
+    if status == "stopped" and (told or last in (None, 0, STOPPED)):  # else it is an earlier attempt's
         return "stopped", reason
     if not attempts and not summary:
         return "new", ""
     if last == FAILED and not summary:  # before there was anything to write down
-        return "failed", last_words(path)
-    return "broken", _how(path, last) if status == "running" or not summary else "summary.json is damaged"
+        return "failed", last_words(path, attempts)
+    if status in ("running", "stopped") or not summary:
+        return "broken", _how(path, attempts)
+    return "broken", "summary.json is damaged"
 
 
-def _how(path: Path, code: int | None) -> str:
+def _how(path: Path, attempts: list[Attempt]) -> str:
+    code = attempts[-1].exit if attempts else None
     if code is None:
         return "its process has gone"
-    return f"killed by signal {-code}" if code < 0 else f"exit code {code}: {last_words(path)}"
+    return f"killed by signal {-code}" if code < 0 else f"exit code {code}: {last_words(path, attempts)}"
 
 
-def last_words(path: Path) -> str:
-    """Return what a run said last, from its last message on."""
+def said_so_far(path: Path) -> int:
+    """Return how many bytes the attempts at a run have printed."""
+    try:
+        return (path / OUTPUT).stat().st_size
+    except OSError:
+        return 0
+
+
+def last_words(path: Path, attempts: list[Attempt]) -> str:
+    """Return what the last attempt said last: its last message, without what mpirun has to say of it in its frames."""
     try:
         with open(path / OUTPUT, "rb") as file:
-            file.seek(max(0, file.seek(0, 2) - 4000))
-            lines = file.read().decode(errors="replace").strip().splitlines()
+            file.seek(max(attempts[-1].output if attempts else 0, file.seek(0, 2) - _WORDS))
+            lines = [line.strip() for line in file.read().decode(errors="replace").strip().splitlines()]
     except OSError:
         return ""
     begins = [n for n, line in enumerate(lines) if line.startswith("petfsi: ")]
-    said = lines[begins[-1] :] if begins else lines[-1:]
-    return "; ".join(line.removeprefix("petfsi: ").strip() for line in said[:8])
+    if begins:
+        said = list(itertools.takewhile(lambda line: not _is_frame(line), lines[begins[-1] :]))
+    else:
+        said = [line for line in lines if not _is_frame(line)][-1:]
+    return "; ".join(line.removeprefix("petfsi: ") for line in said[:8])
+
+
+def _is_frame(line: str) -> bool:
+    return bool(line) and not line.strip("-")
