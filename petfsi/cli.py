@@ -241,6 +241,7 @@ def bench(ctx: click.Context, name: str | None, out: Path, quick: bool) -> NoRet
     type=click.Choice(["failed", "lost", "refused", "changed"]),
     help="Run those of a state again: failed and changed ones from their start, and what was there is put aside.",
 )
+@click.option("--anew", is_flag=True, help="With --retry lost or refused: from their start, too.")
 @click.option(
     "--dry-run", is_flag=True, help="Check all and print the runs, and which --retry begins again; write nothing."
 )

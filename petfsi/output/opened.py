@@ -39,7 +39,10 @@ class OpenedRun:
         """The columns of ``history.csv``: an entry per step, the state at t = 0 first."""
         from petfsi.output.history import read_history
 
-        return read_history(self.path / "history.csv")
+        columns = read_history(self.path / "history.csv")
+        if "step" not in columns:
+            raise InputError(f"{self.path / 'history.csv'} is not a history: it has no columns")
+        return columns
 
     @cached_property
     def scene(self) -> Scene:

@@ -102,11 +102,14 @@ def write_summary(path: Path, summary: Summary, comm: MPI.Comm) -> None:
 def read_summary(path: Path) -> dict[str, Any]:
     """Return a summary as a dictionary. Not collective."""
     try:
-        return json.loads(files.read_small(Path(path), MOST))
+        found = json.loads(files.read_small(Path(path), MOST))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {files.reason(error)}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a summary: {error}") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is not a summary: it is no JSON object")
+    return found
 
 
 def _finite(value: Any) -> Any:

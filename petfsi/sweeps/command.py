@@ -42,6 +42,8 @@ class Wanted:
         ``axis=point,...``, or names of runs; empty for all.
     retry : str or None
         ``failed``, ``lost``, ``refused`` or ``changed``.
+    anew : bool
+        Runs that ``retry`` names begin from their start, whatever there is to go on from.
     dry_run, status, collect : bool
         To do nothing but say what would be done, what is, or write the table.
     """
@@ -51,6 +53,7 @@ class Wanted:
     jobs: int | None = None
     only: str = ""
     retry: str | None = None
+    anew: bool = False
     dry_run: bool = False
     status: bool = False
     collect: bool = False
@@ -83,7 +86,7 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
         say(f"{folder.table}: {len(rows)} runs")
         return DONE
     if wanted.retry and wanted.retry != "changed":
-        _retry(folder, chosen, wanted.retry, say)
+        _retry(folder, chosen, wanted.retry, wanted.anew, say)
     if os.environ.get("PETSC_OPTIONS"):
         say("PETSC_OPTIONS is set, and not read: what a run hangs on stands in the sweep's file")
     why = Pool(folder, chosen, cores, say).work()
@@ -101,6 +104,8 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
 
 def _check_words(wanted: Wanted) -> None:
     """Raise InputError of words that would be without effect beside each other."""
+    if wanted.anew and wanted.retry not in ("lost", "refused"):
+        raise InputError("--anew goes with --retry lost or --retry refused; what failed or changed begins anew anyway")
     only = [name for name in ("dry_run", "status", "collect") if getattr(wanted, name)]
     unheard = {"status": ["retry"], "collect": ["retry", "only", "jobs"]}
     for name in only[:1]:
@@ -170,13 +175,13 @@ def _at_work(folder: SweepFolder, name: str) -> str:
     return f"{folder.run(name)}: a process is at work in it; wait for it, or stop it"
 
 
-def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, say: Callable[[str], None]) -> None:
-    """Let runs of a state be tried again: failed ones from their start, others from where they are."""
+def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, anew: bool, say: Callable[[str], None]) -> None:
+    """Let runs of a state be tried again: failed ones from their start, others from where they are, unless anew."""
     for run in chosen:
         path = folder.run(run.name)
         if look_at(path, run).state != state:
             continue
-        if state == "failed":
+        if state == "failed" or anew:
             _set_aside(folder, run, say)
         else:
             attempts.again(path, state)

@@ -97,9 +97,12 @@ class SweepFolder:
         """
         if not self.plan.is_file():
             raise InputError(f"{self.path} was not made whole; once more: petfsi sweep SWEEP.toml --out {self.path}")
-        with open(self.plan, encoding="utf-8", newline="") as file:
-            hashes = {str(row.get("name")): row.get("hash") for row in csv.DictReader(file)}
         again = f"petfsi sweep SWEEP.toml --out {self.path}"
+        try:
+            with open(self.plan, encoding="utf-8", newline="") as file:
+                hashes = {row["name"]: row["hash"] for row in csv.DictReader(file)}
+        except (OSError, ValueError, KeyError, csv.Error):
+            raise InputError(f"{self.plan} cannot be read; it is written anew by: {again}") from None
         found = []
         for name, wanted in hashes.items():
             run = self.read_run(name)
@@ -118,8 +121,8 @@ class SweepFolder:
         try:
             data = json.loads(files.read_small(self.run(name) / RUN, _MOST))
             told = data.pop("hash")
-            run = Planned(**data)
-            return run if run.hash == told else None
+            run = Planned.of(data)
+            return run if (run.hash, run.name) == (told, name) else None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
 
@@ -146,8 +149,12 @@ class SweepFolder:
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Keep other calls from writing what is the sweep's own while this one does."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        with open(self.path / WRITING, "wb") as file:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            file = open(self.path / WRITING, "wb")  # noqa: SIM115 - closed below
+        except OSError as error:
+            raise InputError(f"sweep folder {self.path} cannot be written: {files.reason(error)}") from error
+        with file:
             with suppress(OSError):  # where the file system knows no locks there is one call at a time, it is hoped
                 fcntl.flock(file, fcntl.LOCK_EX)
             yield

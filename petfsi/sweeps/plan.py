@@ -11,9 +11,11 @@ import itertools
 import json
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,8 @@ from petfsi.sweeps.names import run_name
 INPUTS = "inputs"
 #: Digits of digests in names of files.
 _DIGITS = 12
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_SCENE = re.compile(rf"{INPUTS}/scene-[0-9a-f]{{{_DIGITS}}}\.toml")
 #: Runs that are the same as others, of those that are told.
 _TOLD = 8
 
@@ -64,6 +68,31 @@ class Planned:
     scene: str
     options: list[str]
     says: dict[str, str]
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> Planned:
+        """Return a run from what ``run.json`` says; whatever stands there starts nothing but a run of petfsi.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If anything has another form than ``plan_sweep`` gives it.
+        """
+        run = cls(**data)
+        texts = [*run.axes, *run.axes.values(), *run.says, *run.says.values(), *run.options, run.name, run.scene]
+        counts = [run.ranks, run.repeat, 1 if run.steps is None else run.steps]
+        words = {word.lower() for word in run.options}
+        files = [after for word, after in pairwise(run.options) if word == f"-{options.FILE}"]
+        if (
+            not all(isinstance(text, str) for text in texts)
+            or not all(type(count) is int and count > 0 for count in counts)
+            or not _SCENE.fullmatch(run.scene)
+            or not _NAME.fullmatch(run.name)
+            or any(word.startswith("--") for word in words)  # petfsi's own, such as --out
+            or any("/" in name for name in files)
+        ):
+            raise ValueError("no run of a sweep")
+        return run
 
     @property
     def hash(self) -> str:
