@@ -129,7 +129,7 @@ class Probe(Table):
     at: Annotated[
         Vector | None,
         Field(description="m; in a solid, where the point is at rest"),
-        Doc("Where it is asked. Left out of front and force."),
+        Doc("Where it is asked. Left out of front and force. Of a fluid on a grid nan while no fluid is there."),
     ] = None
     quantity: Annotated[
         Literal["displacement", "velocity", "angle", "pressure", "smoke", "front", "level", "force"],
