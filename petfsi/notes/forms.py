@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from petfsi.errors import InputError
 from petfsi.geometry.beams import axis_mesh
@@ -191,6 +190,8 @@ def _sides(points: np.ndarray) -> np.ndarray:
     ----------
     H. Freeman, R. Shapira, Determining the minimum-area encasing rectangle for an arbitrary closed curve (1975).
     """
+    from scipy.spatial import ConvexHull  # a plan alone needs none of it
+
     around = points[ConvexHull(points).vertices]
     edges = np.roll(around, -1, axis=0) - around
     x, y = (edges / np.linalg.norm(edges, axis=1, keepdims=True)).T
