@@ -6,14 +6,19 @@ meshio knows some types of elements, and takes no blank fields, no sets that are
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import meshio
 import numpy as np
 
-from petfsi.geometry.readers.abaqus_cards import read_cards
-from petfsi.geometry.readers.abaqus_surfaces import Block, Surface, add_surfaces
+from petfsi.geometry.readers.abaqus_cards import Card, read_cards
+from petfsi.geometry.readers.abaqus_scopes import sorted_cards
+from petfsi.geometry.readers.abaqus_sets import KINDS_OF_SETS, Member, NodesOf, Sets
+from petfsi.geometry.readers.abaqus_surfaces import Surface, add_surfaces
+from petfsi.geometry.readers.numbered import Block, joined
+from petfsi.messages import shown
 
 _FLAT = {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}
 #: Families of elements, what they are for is none of a mesh's business: their cells by the number of nodes, and what
@@ -38,94 +43,103 @@ _NODES = {
 _MAKERS = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETRIC MODEL GENERATION")
 
 
-class _Sets:
-    """Sets of numbers by name; a set may hold others, and names have no case."""
+class _Content(NamedTuple):
+    """What is read of a part or of the assembly: nodes, elements, surfaces, and how many lines are of other types."""
 
-    def __init__(self) -> None:
-        self._found: dict[str, list[np.ndarray | str]] = {}
-        self._names: dict[str, str] = {}
-
-    def add(self, name: str, found: list[np.ndarray | str]) -> None:
-        self._names.setdefault(name.upper(), name)
-        self._found.setdefault(name.upper(), []).extend(found)
-
-    def all(self) -> dict[str, np.ndarray]:
-        """Return the numbers of each set."""
-        return {name: self._numbers(key, ()) for key, name in self._names.items()}
-
-    def _numbers(self, key: str, above: tuple[str, ...]) -> np.ndarray:
-        if key in above or len(above) > 20:
-            return np.zeros(0, dtype=np.int64)
-        parts = [self._numbers(part, (*above, key)) if isinstance(part, str) else part
-                 for part in self._found.get(key, [])]  # fmt: skip
-        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *parts]))
+    sets: Sets
+    points: list[tuple[np.ndarray, np.ndarray]]
+    cells: list[Block]
+    surfaces: list[Surface]
+    others: dict[str, int]
 
 
 def read_abaqus(path: Path, notes: list[str]) -> meshio.Mesh:
-    """Return a mesh with its sets of nodes and elements and its surfaces; what is no cell is told."""
-    points: list[tuple[np.ndarray, np.ndarray]] = []
-    cells: list[Block] = []
-    surfaces: list[Surface] = []
-    node_sets, element_sets = _Sets(), _Sets()
-    others: dict[str, int] = {}
-    instances = 0
-    for word, given, lines in read_cards(path):
+    """Return a mesh with its sets of nodes and elements and its surfaces; what is no cell is told.
+
+    Of files with parts it is the one that is instanced, and the assembly's own nodes: points by themselves. Where both
+    have a set of one name, the part's is called Instance.Name.
+    """
+    scopes = sorted_cards(read_cards(path), notes)
+    body = _read(scopes.body, Sets())
+    assembly = _read(scopes.assembly, Sets(body.sets, scopes.instance), own=False)
+    for content, what in ((body, ""), (assembly, " of the assembly")):
+        notes += [f"{n:,} lines of elements{what} of type {name} are not read" for name, n in content.others.items()]
+    points = body.points + assembly.points
+    if not any(len(numbers) for numbers, _ in points):
+        raise meshio.ReadError("no nodes (*NODE)")
+    numbers = {"NSET": [part for part, _ in points], "ELSET": [block.numbers for block in body.cells]}
+    sets: dict[str, dict[str, np.ndarray]] = {}
+    for kind in KINDS_OF_SETS:
+        sets[kind] = _together(body.sets.all(kind), assembly.sets.all(kind), scopes.instance, notes)
+        known = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *numbers[kind]]))
+        for content in (body, assembly):
+            notes += content.sets.missing(kind, known)
+    mesh, tags = joined(points, body.cells, sets["NSET"], sets["ELSET"])
+    add_surfaces(mesh, body.cells, tags, _all_surfaces(body, assembly, scopes.instance, notes), notes)
+    return mesh
+
+
+def _read(cards: list[Card], sets: Sets, own: bool = True) -> _Content:
+    """Return what cards hold; elements only where the nodes are their own, as they are in a part."""
+    content = _Content(sets, [], sets.blocks if own else [], [], {})
+    for word, given, lines in cards:
         if word in ("NODE", "ELEMENT") and "INPUT" in given:
             raise meshio.ReadError(f"*{word} with INPUT: put *INCLUDE, INPUT={given['INPUT']} in the line after it")
         if word == "NODE":
             if given.get("SYSTEM", "R").upper() != "R":
                 raise meshio.ReadError("nodes in coordinates that are not rectangular (*NODE, SYSTEM)")
-            points.append(_nodes(lines))
+            numbers, where = _nodes(lines)
+            if not own and np.any(numbers < 0):
+                raise meshio.ReadError("numbers of nodes must be positive")
+            content.points.append((sets.own(numbers), where))
             if "NSET" in given:
-                node_sets.add(given["NSET"], [points[-1][0]])
+                sets.add("NSET", given["NSET"], [numbers])
         elif word == "ELEMENT":
             name = given.get("TYPE", "?").upper()
             kind, letter = _kind(name)
-            if kind is None:
-                others[name] = others.get(name, 0) + len(lines)
+            if kind is None or not own:
+                content.others[name] = content.others.get(name, 0) + len(lines)
                 continue
             rows = _elements(lines, name, _NODES[kind])
-            cells.append(Block(kind, name, letter, rows[:, 0], rows[:, 1:]))
+            content.cells.append(Block(kind, name, letter, rows[:, 0], rows[:, 1:]))
             if "ELSET" in given:
-                element_sets.add(given["ELSET"], [rows[:, 0]])
-        elif word in ("NSET", "ELSET") and word in given:
-            (node_sets if word == "NSET" else element_sets).add(given[word], list(_members(lines, "GENERATE" in given)))
+                sets.add("ELSET", given["ELSET"], [rows[:, 0]])
+        elif word in KINDS_OF_SETS and word in given:
+            sets.add(word, given[word], list(_members(word, given, lines)), given.get("INSTANCE", ""))
         elif word == "SURFACE":
-            surfaces.append(Surface(given.get("NAME", ""), given, lines))
+            content.surfaces.append(Surface(given.get("NAME", ""), given, lines, sets))
         elif word in _MAKERS:
             raise meshio.ReadError(f"*{word}: nodes and elements must be written out, in one frame")
-        elif word == "INSTANCE":
-            instances += 1
-            if instances > 1 or any(line.strip(", ") for line in lines):
-                raise meshio.ReadError("parts that are moved or there more than once (*INSTANCE): flatten the model")
-    notes += [f"{count:,} lines of elements of type {name} are not read" for name, count in others.items()]
-    if not any(len(numbers) for numbers, _ in points):
-        raise meshio.ReadError("no nodes (*NODE)")
-    sets = {"NSET": node_sets.all(), "ELSET": element_sets.all()}
-    mesh, tags = _joined(points, cells, sets["NSET"], sets["ELSET"])
-    add_surfaces(mesh, cells, tags, surfaces, sets, notes)
-    return mesh
+    return content
 
 
-def _joined(
-    points: list[tuple[np.ndarray, np.ndarray]],
-    cells: list[Block],
-    node_sets: dict[str, np.ndarray],
-    element_sets: dict[str, np.ndarray],
-) -> tuple[meshio.Mesh, np.ndarray]:
-    """Return the mesh and the numbers of its nodes, by which they stand; of a node that is given twice the last."""
-    tags, first = np.unique(np.concatenate([numbers for numbers, _ in points])[::-1], return_index=True)
-    where = np.concatenate([x for _, x in points])[::-1][first]
-    blocks = []
-    for block in cells:
-        place = np.minimum(np.searchsorted(tags, block.nodes), len(tags) - 1)
-        if np.any(tags[place] != block.nodes):
-            raise meshio.ReadError("elements name nodes that the file does not hold")
-        blocks.append(meshio.CellBlock(block.kind, place))
-    sets = {name: [np.flatnonzero(np.isin(block.numbers, chosen)) for block in cells]
-            for name, chosen in element_sets.items()}  # fmt: skip
-    of = {name: np.flatnonzero(np.isin(tags, chosen)) for name, chosen in node_sets.items()}
-    return meshio.Mesh(where, blocks, cell_sets=sets, point_sets=of), tags
+def _together(
+    body: dict[str, np.ndarray], assembly: dict[str, np.ndarray], instance: str, notes: list[str]
+) -> dict[str, np.ndarray]:
+    """Return the sets of both; names that both have are the assembly's, as in what follows it in such a file."""
+    theirs = {name.upper(): numbers for name, numbers in assembly.items()}
+    other = [name for name, numbers in body.items() if not np.array_equal(theirs.get(name.upper(), numbers), numbers)]
+    found = {f"{instance}.{name}" if name in other else name: numbers for name, numbers in body.items()
+             if name in other or name.upper() not in theirs}  # fmt: skip
+    _tell(other, "set", instance, notes)
+    return found | assembly
+
+
+def _all_surfaces(body: _Content, assembly: _Content, instance: str, notes: list[str]) -> list[Surface]:
+    """Return the surfaces of both; a name that both have is the assembly's."""
+    theirs = {surface.name.upper() for surface in assembly.surfaces if surface.name}
+    other = [surface.name for surface in body.surfaces if surface.name.upper() in theirs]
+    _tell(list(dict.fromkeys(other)), "surface", instance, notes)
+    mine = [surface._replace(name=f"{instance}.{surface.name}") if surface.name in other else surface
+            for surface in body.surfaces]  # fmt: skip
+    return mine + assembly.surfaces
+
+
+def _tell(names: list[str], what: str, instance: str, notes: list[str]) -> None:
+    if names:
+        told = shown(", ".join(names), 100)
+        notes.append(f"part and assembly each have a {what} {told}: that of the part is {instance}.{names[0]}"
+                     + (" and so on" if len(names) > 1 else ""))  # fmt: skip
 
 
 def _kind(name: str) -> tuple[str | None, str]:
@@ -154,13 +168,16 @@ def _elements(lines: list[str], name: str, nodes: int) -> np.ndarray:
     return numbers.reshape(-1, nodes + 1)
 
 
-def _members(lines: list[str], generated: bool) -> Iterator[np.ndarray | str]:
-    """Yield numbers and names of other sets."""
-    if generated:
+def _members(word: str, given: Mapping[str, str], lines: list[str]) -> Iterator[Member]:
+    """Yield numbers and names of other sets of a card *NSET or *ELSET."""
+    if word == "NSET" and "ELSET" in given:
+        yield NodesOf(given["ELSET"].upper())
+        return
+    if "GENERATE" in given:
         for line in lines:
             first, last, step = ([int(field) for field in line.split(",") if field.strip()] + [1])[:3]
             yield np.arange(first, last + 1, max(step, 1))
         return
     fields = [field.strip() for field in ",".join(lines).split(",") if field.strip()]
     yield np.array([field for field in fields if field.isdigit()], dtype=np.int64)
-    yield from (field.strip('"').upper() for field in fields if not field.isdigit())
+    yield from (field.replace('"', "").upper() for field in fields if not field.isdigit())

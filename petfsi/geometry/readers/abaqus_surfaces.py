@@ -13,6 +13,8 @@ from typing import NamedTuple
 import meshio
 import numpy as np
 
+from petfsi.geometry.readers.abaqus_sets import KINDS_OF_SETS, Sets
+from petfsi.geometry.readers.numbered import Block
 from petfsi.geometry.splitting import KINDS
 from petfsi.messages import shown
 
@@ -31,35 +33,13 @@ _FACETS = {2: "line", 3: "triangle", 4: "quad"}
 _WHOLE = ("SPOS", "SNEG")
 
 
-class Block(NamedTuple):
-    """Elements of one type.
-
-    Attributes
-    ----------
-    kind : str
-        The cell, by meshio's name.
-    type : str
-        As the file has it.
-    letter : str
-        What the names of its sides begin with, S or E; nothing if it has none.
-    numbers : ndarray of int, shape (n,)
-    nodes : ndarray of int, shape (n, k)
-        By the file's numbers.
-    """
-
-    kind: str
-    type: str
-    letter: str
-    numbers: np.ndarray
-    nodes: np.ndarray
-
-
 class Surface(NamedTuple):
-    """A card *SURFACE: its name, what is given with it and its lines."""
+    """A card *SURFACE: its name, what is given with it, its lines and the sets that these name."""
 
     name: str
     given: Mapping[str, str]
     lines: list[str]
+    sets: Sets
 
     @property
     def type(self) -> str:
@@ -91,7 +71,6 @@ def add_surfaces(
     blocks: list[Block],
     tags: np.ndarray,
     surfaces: list[Surface],
-    sets: Mapping[str, Mapping[str, np.ndarray]],
     notes: list[str],
 ) -> None:
     """Give a mesh the facets and nodes of surfaces as groups; those that cannot be read whole are told.
@@ -108,24 +87,22 @@ def add_surfaces(
     tags : ndarray of int, shape (n_points,)
         Numbers of the nodes, ascending.
     surfaces : list of Surface
-    sets : mapping
-        The sets of elements (``"ELSET"``) and nodes (``"NSET"``) by name.
     notes : list of str
     """
     unread: dict[str, list[str]] = {}
     found, bare = _Found(), _Bare(mesh)
-    upper = {kind: {name.upper(): numbers for name, numbers in of.items()} for kind, of in sets.items()}
+    elements = np.concatenate([np.zeros(0, dtype=np.int64), *(block.numbers for block in blocks)])
     for surface in _joined(surfaces):
-        name, given, lines = surface
+        name, given = surface.name, surface.given
         try:
             if not name:
                 raise _Unread("it has no name")
             if "COMBINE" in given or surface.type not in ("ELEMENT", "NODE"):
                 raise _Unread("COMBINE" if "COMBINE" in given else f"TYPE={surface.type}")
             if surface.type == "NODE":
-                _find_nodes(found, name, mesh, tags, _members(lines, upper["NSET"], "nodes", tags)[""])
+                _find_nodes(found, name, mesh, tags, _members(surface, "NSET", tags)[""])
             else:
-                members = _of_elements(lines, upper["ELSET"], blocks)
+                members = _members(surface, "ELSET", elements)
                 hidden = _find_facets(found, name, mesh, blocks, bare, members)
                 notes += [f"{shown(name, 100)} is a surface and a set of other {what}: as a place it is the surface"
                           for what in hidden]  # fmt: skip
@@ -152,7 +129,9 @@ def _joined(surfaces: list[Surface]) -> list[Surface]:
     for surface in surfaces:
         key = surface.name.upper()
         name = names.setdefault(key, surface.name)
-        first = found.setdefault((key, surface.type, "COMBINE" in surface.given), Surface(name, surface.given, []))
+        first = found.setdefault(
+            (key, surface.type, "COMBINE" in surface.given), Surface(name, surface.given, [], surface.sets)
+        )
         first.lines.extend(surface.lines)
     return sorted(found.values(), key=lambda surface: surface.type != "NODE")
 
@@ -160,19 +139,18 @@ def _joined(surfaces: list[Surface]) -> list[Surface]:
 # ---- what lines name ----------------------------------------------------------------------------------------
 
 
-def _of_elements(lines: list[str], sets: Mapping[str, np.ndarray], blocks: list[Block]) -> dict[str, np.ndarray]:
-    known = np.concatenate([np.zeros(0, dtype=np.int64), *(block.numbers for block in blocks)])
-    return _members(lines, sets, "elements", known)
-
-
-def _members(lines: list[str], sets: Mapping[str, np.ndarray], what: str, known: np.ndarray) -> dict[str, np.ndarray]:
+def _members(surface: Surface, kind: str, known: np.ndarray) -> dict[str, np.ndarray]:
     """Return the numbers that lines name, by the name of the side that follows; of nodes that is an area."""
+    what = KINDS_OF_SETS[kind]
     found: dict[str, list[np.ndarray]] = {}
-    for line in lines:
-        first, side, *_ = (field.strip().strip('"').upper() for field in f"{line},,".split(","))
+    for line in surface.lines:
+        first, side, *_ = (field.strip().replace('"', "").upper() for field in f"{line},,".split(","))
         if not first:
             raise _Unread(f"a line names no {what}")
-        found.setdefault(side if what == "elements" else "", []).append(_numbers(first, sets, what))
+        chosen = surface.sets.find(kind, first)
+        if chosen is None:
+            raise _Unread(f"no set of {what} {shown(first, 50)} is read")
+        found.setdefault(side if kind == "ELSET" else "", []).append(chosen)
     numbers = {side: np.unique(np.concatenate(parts)) for side, parts in found.items()}
     if not any(map(len, numbers.values())):
         raise _Unread(f"it names no {what}")
@@ -180,16 +158,6 @@ def _members(lines: list[str], sets: Mapping[str, np.ndarray], what: str, known:
     if missing:
         raise _Unread(f"it names {missing:,} {what} that are not read or not there")
     return numbers
-
-
-def _numbers(word: str, sets: Mapping[str, np.ndarray], what: str) -> np.ndarray:
-    """Return the numbers of a set, or a number; before them there may be the name of the one instance and a dot."""
-    for name in (word, word.rpartition(".")[2]):
-        if name in sets:
-            return sets[name]
-        if name.isdigit():
-            return np.array([int(name)], dtype=np.int64)
-    raise _Unread(f"no set of {what} {shown(word, 50)} is read")
 
 
 # ---- their facets and nodes ---------------------------------------------------------------------------------
