@@ -124,19 +124,21 @@ def _with_companions(path: Path) -> list[Path]:
     others = {path.with_suffix(e) for pair in _PAIRS if ending in pair for e in pair - {ending}}
     if ending in (".xdmf", ".xmf"):
         others |= {path.parent / name for name in _HDF5_ITEM.findall(path.read_text(errors="replace"))}
-    if ending in (".inp", ".msh"):
-        others |= _included(path)
+    others |= _included(path)
     return [path, *sorted(other for other in others if other.is_file() and other != path)]
 
 
 def _included(path: Path) -> set[Path]:
-    """Return the files that one of Abaqus's includes, and those that these do."""
-    from petfsi.geometry.readers.abaqus_cards import included_names, read_text
+    """Return the files that one of Abaqus's or Nastran's includes, and those that these do."""
+    from petfsi.geometry.readers import abaqus_cards, nastran_cards
+    from petfsi.geometry.readers.formats import find_readers
 
+    known = {"abaqus": abaqus_cards, "nastran": nastran_cards}
+    cards = next((known[name] for name, _ in find_readers(path) if name in known), None)
     found: set[Path] = set()
-    rest = [path]
-    while rest:
-        names = included_names(read_text(rest.pop()))
+    rest = [path] if cards else []
+    while cards and rest:
+        names = cards.included_names(cards.read_text(rest.pop()))
         new = {path.parent / name for name in names if Path(name).name == name} - found
         found |= new
         rest += [other for other in new if other.is_file()]

@@ -19,7 +19,10 @@ from scipy.io import netcdf_file
 _KINDS: dict[str, tuple[dict[int, str], tuple[tuple[int, ...], ...]]] = {
     "TRI": ({3: "triangle", 6: "triangle6"}, ((0, 1), (1, 2), (2, 0))),
     "QUA": ({4: "quad", 8: "quad8", 9: "quad9"}, ((0, 1), (1, 2), (2, 3), (3, 0))),
-    "SHE": ({3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}, ()),
+    # two faces, then edges
+    "SHE": ({4: "quad", 8: "quad8", 9: "quad9"},
+            ((0, 1, 2, 3), (0, 3, 2, 1), (0, 1), (1, 2), (2, 3), (3, 0))),
+    "TRISHE": ({3: "triangle", 6: "triangle6"}, ((0, 1, 2), (0, 2, 1), (0, 1), (1, 2), (2, 0))),
     "TET": ({4: "tetra", 10: "tetra10"}, ((0, 1, 3), (1, 2, 3), (0, 3, 2), (0, 2, 1))),
     "PYR": ({5: "pyramid", 13: "pyramid13", 14: "pyramid14"},
             ((0, 1, 4), (1, 2, 4), (2, 3, 4), (0, 4, 3), (0, 3, 2, 1))),

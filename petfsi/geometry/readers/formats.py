@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import tempfile
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from meshio._mesh import topological_dimension
 from petfsi.geometry.readers.abaqus import read_abaqus
 from petfsi.geometry.readers.exodus import read_exodus
 from petfsi.geometry.readers.gmsh import read_gmsh
+from petfsi.geometry.readers.nastran import read_nastran
 
 #: Takes a file and a list of what its user should know of how it was read.
 Reader = Callable[[Path, list[str]], meshio.Mesh]
@@ -36,6 +36,7 @@ _BEGINNINGS = tuple(
         (rb"(#[^\n]*\n|\s)*\d+ +\d+ +\d+ +\d+ +\d+\s*\n", "avsucd"),
         (rb"\d+ +\d+ +\d+ *\r?\n *[-+.\de]+ +[-+.\de]+ +\d+ *\r?\n", "freefem"),
         (rb"\(", "ansys"),
+        (rb"(?ms).*?^\s*(BEGIN\s+BULK|CEND|GRID\*?[\s,]+\d)", "nastran"),
     )
 )
 #: Formats by endings, where meshio has none, or one that the beginning should have told.
@@ -48,6 +49,8 @@ _REFUSED = {
     "inp": "it begins neither as Abaqus's files do nor as AVS's",
     "msh": "it begins as files of neither Gmsh, nor ANSYS, Abaqus or FreeFem do",
 }
+#: Parts of medit's files with what remeshing must keep.
+_MEDIT_KEPT = re.compile(r"\s*(Required|Ridges|Corners|Normal|Tangent|ParallelE)")
 #: Formats of surfaces that trimesh reads, too.
 _SURFACES = ("obj", "off", "ply", "stl")
 
@@ -104,7 +107,20 @@ def _by_trimesh(path: Path, notes: list[str]) -> meshio.Mesh:
     surface = trimesh.load_mesh(path, process=False, skip_materials=True, fix_texture=False)
     if not len(surface.faces):  # it reads what is no mesh as one without faces
         raise meshio.ReadError("no faces")
+    told = _faces_told(path)
+    if told and told != len(surface.faces):
+        notes.append(f"{told:,} faces, of which some have more than three corners, are cut into {len(surface.faces):,}")
     return meshio.Mesh(np.asarray(surface.vertices), [("triangle", np.asarray(surface.faces))])
+
+
+def _faces_told(path: Path) -> int:
+    """Return how many faces a file says that it has, or 0 if that is not found."""
+    data, ending = path.read_bytes(), path.suffix.lower()
+    if ending == ".obj":
+        return len(re.findall(rb"^\s*f\s", data, re.MULTILINE))
+    pattern = rb"element\s+face\s+(\d+)" if ending == ".ply" else rb"\s*OFF\s+(?:#[^\n]*\s+)*\d+\s+(\d+)"
+    found = re.search(pattern, data[:HEAD]) if ending in (".ply", ".off") else None
+    return int(found[1]) if found else 0
 
 
 def _of_text(text: str, name: str) -> meshio.Mesh:
@@ -143,15 +159,12 @@ def _read_stl(path: Path, notes: list[str]) -> meshio.Mesh:
     return meshio.Mesh(points, [("triangle", np.arange(len(points)).reshape(-1, 3))])
 
 
-def _read_nastran(path: Path, notes: list[str]) -> meshio.Mesh:
-    """Return what meshio reads of bulk data, whose first and last lines may be missing."""
-    lines = path.read_text(errors="replace").splitlines()
-    bulk = next((n for n, line in enumerate(lines) if line.strip().upper().startswith("BEGIN BULK")), -1)
-    text = "\n".join(["BEGIN BULK", *lines[bulk + 1 :], "ENDDATA", ""])
-    mesh = reader_map["nastran"](io.StringIO(text))
-    if np.any(mesh.point_data.get("nastran:ref", 0)):
-        raise meshio.ReadError("points in coordinates of their own (GRID with CP)")
-    return mesh
+def _read_medit(path: Path, notes: list[str]) -> meshio.Mesh:
+    """Return what meshio reads, which ends at parts that say nothing of the mesh but what remeshing must keep."""
+    if path.read_bytes()[:4] in (b"\1\0\0\0", b"\0\0\0\1"):  # how binary files begin
+        return reader_map["medit"](str(path))
+    pieces = re.split(r"(?m)^(?=[^\S\n]*[A-Za-z])", path.read_text(errors="replace"))
+    return _of_text("".join(piece for piece in pieces if not _MEDIT_KEPT.match(piece)), "medit")
 
 
 def _read_su2(path: Path, notes: list[str]) -> meshio.Mesh:
@@ -188,6 +201,6 @@ def _read_freefem(path: Path, notes: list[str]) -> meshio.Mesh:
 
 
 _OWN: dict[str, Reader] = {
-    "gmsh": read_gmsh, "abaqus": read_abaqus, "exodus": read_exodus, "nastran": _read_nastran, "su2": _read_su2,
-    "freefem": _read_freefem, "vtk": _read_vtk, "stl": _read_stl,
+    "gmsh": read_gmsh, "abaqus": read_abaqus, "exodus": read_exodus, "nastran": read_nastran, "su2": _read_su2,
+    "freefem": _read_freefem, "medit": _read_medit, "vtk": _read_vtk, "stl": _read_stl,
 }  # fmt: skip
