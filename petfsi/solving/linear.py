@@ -20,6 +20,11 @@ from petfsi.solving.system import System, blown_up
 
 #: What round-off of a first guess of the pressure may leave, as a part of the right-hand side.
 COARSEST_PRESSURE = 1e-8
+#: What flows out of cells may be so many times the tolerance, as a part of what flows through their faces. The residual
+#: of the whole tells little of it where solids are far heavier than what they move, or far stiffer.
+CONTINUITY = 1e3
+#: It is mended at most so many times, and a step that still leaves this part has failed.
+MENDS, LEAK = 8, 1e-3
 
 
 class _Iterations:
@@ -174,8 +179,64 @@ class LinearSolver:
                 self._inner.number = iterations
                 norms = system.update_residual(x, b)
             lost = system.round_off_at(x)
+        if self._pressure is not None and self._pressure.eliminates and not fixed:
+            more, norms = self._close_cells(b, x, CONTINUITY * rtol, norms)
+            iterations += more
         require_convergence(self.method, [ksp, *_inner_solvers(ksp)], norms, slack, floor, lost)
         return iterations, norms
+
+    def _close_cells(
+        self, b: PETSc.Vec, x: PETSc.Vec, rtol: float, norms: dict[str, float]
+    ) -> tuple[int, dict[str, float]]:
+        """Refine x until what flows out of cells is small beside what flows through their faces. Collective.
+
+        Parameters
+        ----------
+        b, x : PETSc.Vec
+        rtol : float
+            What is small.
+        norms : dict of str to float
+            Of the residual at x.
+
+        Returns
+        -------
+        int, dict of str to float
+            Iterations, and the norms there.
+
+        Raises
+        ------
+        SolveError
+            On every rank, if cells leak.
+        """
+        system, ksp = self.system, self._ksp
+        assert ksp is not None and self._pressure is not None
+        fluid = self._pressure.fluid
+        name, piece = fluid.name, system.piece(fluid.name)
+        if norms[name] <= rtol * system.norm(b, piece):
+            return 0, norms
+        y = x.copy()
+        y.array[piece] = 0.0
+        through = system.norm(b, piece) + system.update_residual(y, b)[name]
+        wanted = max(rtol * through, fluid.round_off(system.values(x)[system.fields.index(fluid)]))
+        norms, total = system.update_residual(x, b), 0
+        self._pressure.aim(wanted)
+        for _ in range(MENDS):
+            if norms[name] <= wanted:
+                break
+            self._inner.number = 0
+            ksp.getPC().apply(system.residual, y)
+            x.axpy(1.0, y)
+            total += self._inner.number
+            norms = system.update_residual(x, b)
+        y.destroy()
+        if norms[name] > max(wanted, LEAK * through):
+            raise SolveError(
+                f"solver '{ksp.getOptionsPrefix()}' keeps fluid in its cells no better than to "
+                f"{norms[name] / through:.1e} of what flows through them, wanted {rtol:.1e}: solids are far heavier or "
+                f"stiffer than what they move. To tell the solver from the physics, run this step with -options_file "
+                f"monolithic-direct.opts."
+            )
+        return total, norms
 
     def _drop_coarse_guess(self, b: PETSc.Vec, x: PETSc.Vec, wanted: float, size: float) -> None:
         """Begin from zero if the guess is too coarse to get from it to what is wanted, and no better. Collective."""

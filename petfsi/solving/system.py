@@ -169,6 +169,11 @@ class System:
         norms["rhs"] = float(total[-1])
         return norms
 
+    def norm(self, x: PETSc.Vec, piece: slice) -> float:
+        """Return the norm of a field's part of a vector. Collective."""
+        part = x.array_r[piece]
+        return float(np.sqrt(self.comm.allreduce(float(part @ part))))
+
     def round_off(self, x: PETSc.Vec | None = None) -> float:
         """Return what the norm of the residual at x (the solution if not given) cannot fall below. Collective."""
         return sum(field.round_off(part) for field, part in zip(self.fields, self.values(x), strict=True))
