@@ -17,6 +17,7 @@ from petfsi.geometry.bodies import enclosed
 from petfsi.geometry.collisions import Meeting, Way, any_within, crossings
 from petfsi.geometry.obstacles import named_surfaces, side_walls
 from petfsi.geometry.touching import (
+    Turn,
     depths,
     drawn_in,
     first_on_ways,
@@ -24,6 +25,7 @@ from petfsi.geometry.touching import (
     stations,
     straight_parts,
     swept_boxes,
+    turn_of,
 )
 from petfsi.ranks import on_root
 from petfsi.scene.schema import Scene
@@ -126,6 +128,8 @@ class Watch:
     def __init__(self, comm: MPI.Comm, scene: Scene, solid: SolidField) -> None:
         self._period = periods(scene.fluid, scene.dim)
         self._repeats = bool(np.any(self._period > 0.0))
+        self._solid = solid
+        self._turns: dict[int, Turn] = {}
         self._x, self._room, self._wait = solid.surface_present(), 0.0, 0
         self._things = _bodies(scene, solid, self._x) + on_root(comm, lambda: _still(scene))
         self._n = len(scene.solids)
@@ -149,15 +153,17 @@ class Watch:
         self._x, self._room = solid.surface_present(), 0.0
 
     def judge(self, x: np.ndarray, t: float, dt: float) -> None:
-        """Raise if anything meets in the step from t to t + dt that ends with points at x (n, dim). Not collective.
+        """Raise if anything meets in the step from t to t + dt that ends with points at x (n, dim). Collective.
+
+        The step is that after the one that the solid accepted last.
 
         Raises
         ------
         TouchError
             On all ranks.
         """
-        # no two points can have come nearer than by twice the way of the fastest
-        self._room -= 2.0 * np.sqrt(x.shape[1]) * float(np.abs(x - self._x).max())
+        # no two points can have come nearer than by twice the way of the fastest, on half a turn at most
+        self._room -= np.pi * np.sqrt(x.shape[1]) * float(np.abs(x - self._x).max())
         if self._room > 0.0:
             self._x = x
             return
@@ -176,7 +182,7 @@ class Watch:
         """Return what would meet, where and when, in a step as ``judge`` has it; nothing if that is no step to take.
 
         What only touches at the end has met here, too: the way goes on by twice what bodies are drawn in, or by
-        ``AHEAD``. Farther than all is wide only what has blown up goes. Not collective.
+        ``AHEAD``. Farther than all is wide only what has blown up goes. Collective.
         """
         way, ends = float(np.abs(x - self._x).max()), np.concatenate((self._x, *self._still))
         if not 0.0 < way < np.ptp(ends, axis=0).max():
@@ -195,6 +201,7 @@ class Watch:
         """
         first, said = 2.0, ""
         parts: dict[tuple[int, int], list[Way]] = {}
+        self._turns = {}
         for one, other, shift in self._near(low, high):
             b = self._things[other]
             if b.place is None and not any_within(b.points, b.facets, low[one] + shift, high[one] + shift):
@@ -229,11 +236,13 @@ class Watch:
     def _boxes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners of the box in which each thing stays on the way to x, shape (n_things, dim).
 
-        Points on arcs about a body's centre leave their chord by less than half of it, up to a half turn.
+        Points on arcs about a body's centre leave their chord by less than half of it, up to a half turn, and so does
+        that centre: by 1/2 tan(a/4) of its way, where the angle a is less than pi/2 times a point's chord over its
+        radius.
         """
-        low, high, turned = swept_boxes(self._x, x, self._first)
-        bulge = 0.5 * np.sqrt(turned)[:, None]
-        self._turned = turned
+        low, high, self._turned, self._way = swept_boxes(self._x, x, self._first)
+        angles = self._turned / np.array([thing.radius for thing in self._things[: self._n]])
+        bulge = (0.5 * self._turned + 0.5 * self._way * np.minimum(0.5 * angles, 1.0))[:, None]
         return np.concatenate((low - bulge, self._still[0])), np.concatenate((high + bulge, self._still[1]))
 
     def _clearance(self, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
@@ -292,9 +301,20 @@ class Watch:
     def _parts(self, number: int, x: np.ndarray) -> int:
         """Return how many straight ways a thing needs."""
         thing = self._things[number]
-        if thing.place is None or self._turned[number] <= 8.0 * thing.slack * thing.radius:
+        if thing.place is None:
             return 1
-        return straight_parts(self._x[thing.place], x[thing.place], thing.slack)
+        turned, way = self._turned[number], self._way[number]
+        if turned * (turned + way) <= 8.0 * thing.slack * thing.radius:
+            return 1
+        return straight_parts(self._x[thing.place], self._turn(number, x), thing.slack)
+
+    def _turn(self, number: int, x: np.ndarray) -> Turn:
+        """Return how a body turns on its way to x. Collective, the first time."""
+        if number not in self._turns:
+            place = self._things[number].place
+            velocity = self._solid.surface_speed()[place].mean(axis=0)
+            self._turns[number] = turn_of(self._x[place], x[place], velocity)
+        return self._turns[number]
 
     def _ways(self, number: int, n: int, x: np.ndarray, known: dict[tuple[int, int], list[Way]]) -> list[Way]:
         """Return the n straight ways of a thing to x, drawn in."""
@@ -302,7 +322,9 @@ class Watch:
         if thing.place is None:
             return [Way(thing.points, thing.points, thing.facets)] * n
         if (number, n) not in known:
-            places = [thing.drawn(y) for y in stations(self._x[thing.place], x[thing.place], n)]
+            start, end = self._x[thing.place], x[thing.place]
+            passed = [start, end] if n == 1 else stations(start, end, self._turn(number, x), n)
+            places = [thing.drawn(y) for y in passed]
             known[number, n] = [Way(a, b, thing.facets) for a, b in zip(places[:-1], places[1:], strict=True)]
         return known[number, n]
 

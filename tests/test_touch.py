@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from processes import environment
 from step_cases import prepared, stored
+from test_guard import until_it_stops
 from test_restart import reader
 from test_run import PETFSI
 from touch_cases import (
@@ -310,6 +311,49 @@ def test_a_pendulum_swings_into_a_post_and_past_what_it_does_not_reach(dt):
     assert what == "obstacles.far"
     # from the horizontal to 45 degrees beyond the vertical, by the pendulum's own equation
     assert 0.25 < when < 0.6
+
+
+def on_a_string(angle, radius, at):
+    """Return a scene of a block of 0.5 m, 4 m below a pivot that it swings about by ``angle`` a step, and of a pin."""
+    turned = {"x": f"x*(cos({angle}*t)-1) - y*sin({angle}*t)", "y": f"x*sin({angle}*t) + y*(cos({angle}*t)-1)"}
+    block = {
+        "shape": {"box": {"origin": [-0.25, -4.25], "size": [0.5, 0.5], "cells": [2, 2]}},
+        "density": 1000.0,
+        "young": 1e6,
+        "poisson": 0.3,
+        "supports": [{"where": "all", "fix": ["x", "y"], "displacement": turned}],
+    }
+    pin = {"shape": ball([radius * np.sin(at), -radius * np.cos(at)], 0.01)}
+    fluid = {"density": 1e-3, "origin": [-2.0, -5.0], "size": [5.0, 4.0], "cells": [50, 40]}
+    fluid["sides"] = dict.fromkeys(("left", "right", "top", "bottom"), "open")
+    table = {"dim": 2, "time": {"end": 2.0, "dt": 1.0}, "solids": {"b": block}, "obstacles": {"pin": pin}}
+    return scene_from_dict(table | {"fluid": fluid})
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.25, 0.4])
+@pytest.mark.parametrize("part", [0.3, 0.5])
+def test_what_swings_far_from_its_pivot_meets_what_is_on_its_arc_and_no_more(angle, part):
+    """Its outer face is at 4.25 m and more, its inner one at 3.75 m and more: its chord is up to 0.08 m off."""
+    outer = np.hypot(4.25, 0.25)
+    for radius, meets in ((outer - 0.02, True), (outer + 0.02, False), (3.77, True), (3.735, False)):
+        # beside the block's corners at both ends of the step in which it passes
+        with prepared(on_a_string(angle, radius, (1.0 + part) * angle), *LU) as sim:
+            _, why = until_it_stops(sim, 2)
+        assert ("enters obstacles.pin" in why) == meets, (radius, why)
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.2])
+def test_a_bar_hinged_above_the_floor_turns_down_to_it_in_any_step(dt):
+    """Its lowest point is 0.0015 - 0.001 sin(0.4) m above the floor."""
+    bar = beam([0.0, 0.0015], [0.0, 1.0015], 0.002, 4)
+    hinged = solid(bar, density=1000.0, young=1e11, supports=[{"where": "start", "fix": ["x", "y"]}],
+                   initial={"velocity": ["-(y-.0015)", "0", "1"]})  # fmt: skip
+    fluid = {"density": 1e-6, "origin": [-0.6, 0.0], "size": [1.2, 1.2], "cells": [30, 30],
+             "sides": dict.fromkeys(("left", "right", "top"), "open")}  # fmt: skip
+    table = {"dim": 2, "time": {"end": 0.4, "dt": dt}, "fluid": fluid, "solids": {"bar": hinged}}
+    with prepared(scene_from_dict(table)) as sim:
+        while not sim.finished:
+            sim.advance()
 
 
 def test_a_spinning_brick_meets_another_with_an_edge():

@@ -11,6 +11,7 @@ from petfsi.geometry.touching import (
     shortest_edges,
     stations,
     straight_parts,
+    turn_of,
 )
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
@@ -123,13 +124,44 @@ def test_bodies_turn_on_arcs(dim, angle):
         return (start - centre) @ rotation.T + centre + part * 0.3
 
     slack = 1e-4
-    n = straight_parts(start, at(1.0), slack)
-    places = stations(start, at(1.0), n)
+    turning = turn_of(start, at(1.0), np.full(dim, 0.3))
+    n = straight_parts(start, turning, slack)
+    places = stations(start, at(1.0), turning, n)
     assert len(places) == n + 1 and (n == 1) == (angle < 0.02)
     for k, x in enumerate(places):
         np.testing.assert_allclose(x, at(k / n), atol=1e-12)
     middle = [0.5 * (a + b) - at((k + 0.5) / n) for k, (a, b) in enumerate(zip(places[:-1], places[1:], strict=True))]
     assert np.linalg.norm(middle, axis=2).max() < 1.01 * slack
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("angle", [1e-9, 1e-4, 0.25, 1.0, 3.0])
+@pytest.mark.parametrize("along", [0.0, 0.7])
+def test_bodies_turn_about_pivots_far_from_their_centres(dim, angle, along):
+    """Told by the direction in which they set out; in 3D they may go along the axis, too, as on a screw."""
+    rng = np.random.default_rng(5)
+    axis = np.array([0.0, 0.0, 1.0]) if dim == 2 else rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    pivot, start = rng.uniform(-4.0, 4.0, dim), rng.uniform(-0.1, 0.1, (20, dim))
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    drift = (along * axis)[:dim] * (dim == 3)
+
+    def at(part):
+        a = part * angle
+        rotation = (np.eye(3) + np.sin(a) * k + (1 - np.cos(a)) * k @ k)[:dim, :dim]
+        return (start - pivot) @ rotation.T + pivot + part * drift
+
+    sets_out = angle * k[:dim, :dim] @ (start.mean(axis=0) - pivot) + drift
+    slack = 1e-5
+    turning = turn_of(start, at(1.0), sets_out)
+    n = max(straight_parts(start, turning, slack), 2)
+    for part, x in zip(np.arange(n + 1) / n, stations(start, at(1.0), turning, n), strict=True):
+        np.testing.assert_allclose(x, at(part), atol=2e-13 / min(angle, 1e-3) if angle < 0.1 else 1e-12)
+    assert n > 2 or angle < 0.1
+    # what flies straight and spins by the same angle has the same ends, and another way
+    straight = turn_of(start, at(1.0), (at(1.0) - start).mean(axis=0))
+    middle = stations(start, at(1.0), straight, 2)[1].mean(axis=0)
+    np.testing.assert_allclose(middle, 0.5 * (start + at(1.0)).mean(axis=0), atol=1e-12)
 
 
 def test_a_bar_that_turns_half_around_in_a_step_meets_what_its_chords_pass_by():
@@ -138,8 +170,9 @@ def test_a_bar_that_turns_half_around_in_a_step_meets_what_its_chords_pass_by():
     pin = (SQUARE[0] - 0.5) * 1e-4 + [0.0, 0.9]
     c, s = np.cos(3.0), np.sin(3.0)
     end = bar @ np.array([[c, s], [-s, c]])
-    n = straight_parts(bar, end, 1e-5)
-    places = stations(bar, end, n)
+    turning = turn_of(bar, end, np.zeros(2))
+    n = straight_parts(bar, turning, 1e-5)
+    places = stations(bar, end, turning, n)
     ways = [Way(a, b, SQUARE[1]) for a, b in zip(places[:-1], places[1:], strict=True)]
     found = first_on_ways(ways, [Way(pin, pin, SQUARE[1])] * n)
     # its upper face reaches the pin's corner when the distance from the bar's axis is half its thickness

@@ -277,6 +277,10 @@ class JointSolid(SolidField):
         """Return the present positions of its points, shape (n_points, dim). Collective."""
         return np.concatenate([part.surface_present() for part in self.parts])
 
+    def surface_speed(self) -> np.ndarray:
+        """Return w of the step last accepted at the points of ``surface_present``. Collective."""
+        return np.concatenate([part.surface_speed() for part in self.parts])
+
     def surface_shift(self) -> np.ndarray:
         """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective."""
         return np.concatenate([part.surface_shift() for part in self.parts])

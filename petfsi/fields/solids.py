@@ -164,6 +164,13 @@ class SolidField(Field):
         """Return the present positions of its points, shape (n_points, dim), on every rank. Collective."""
 
     @abstractmethod
+    def surface_speed(self) -> np.ndarray:
+        """Return w of the step last accepted, at first the velocity at the start, at the points of ``surface_present``.
+
+        Shape (n_points, dim), m/s, on every rank. Collective.
+        """
+
+    @abstractmethod
     def surface_shift(self) -> np.ndarray:
         """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -57,7 +58,7 @@ def _drawn_in(points, facets, amount):
 
 @njit(cache=True)
 def swept_boxes(start, end, first):
-    """Return the corners of the box of each body's straight way, and the largest square of how far points turn, m^2.
+    """Return the corners of the box of each body's straight way, how far its points turn, and how far it goes itself.
 
     Parameters
     ----------
@@ -69,11 +70,12 @@ def swept_boxes(start, end, first):
     Returns
     -------
     low, high : ndarray, shape (n_bodies, dim)
-    turned : ndarray, shape (n_bodies,)
-        What points move besides their mean.
+    turned, way : ndarray, shape (n_bodies,)
+        The most that points move besides their mean, and that, m.
     """
     n, dim = len(first) - 1, start.shape[1]
-    low, high, turned = np.full((n, dim), np.inf), np.full((n, dim), -np.inf), np.zeros(n)
+    low, high = np.full((n, dim), np.inf), np.full((n, dim), -np.inf)
+    turned, way = np.zeros(n), np.zeros(n)
     mean = np.zeros(dim)
     for body in range(n):
         mean[:] = 0.0
@@ -86,42 +88,92 @@ def swept_boxes(start, end, first):
             square = 0.0
             for a in range(dim):
                 square += (end[i, a] - start[i, a] - mean[a]) ** 2
-            turned[body] = max(turned[body], square)
-    return low, high, turned
+            turned[body] = max(turned[body], np.sqrt(square))
+        way[body] = np.sqrt(np.sum(mean**2))
+    return low, high, turned, way
 
 
-def straight_parts(start: np.ndarray, end: np.ndarray, slack: float) -> int:
-    """Return into how many straight ways that of a body must be divided, so that none is ``slack`` (m) off an arc.
+class Turn(NamedTuple):
+    """How a body gets from one place to another: about its centre, and that with it.
 
-    An angle a leaves its chord by r a^2/8 at the distance r from the centre.
+    Attributes
+    ----------
+    vector : ndarray, shape (3,)
+        Axis times angle of the rotation that fits best.
+    arm : ndarray, shape (dim,)
+        From the point that this rotation alone leaves in its place to the centre, before; zero where the centre does
+        not turn about it but goes straight, m.
+    """
+
+    vector: np.ndarray
+    arm: np.ndarray
+
+    @property
+    def angle(self) -> float:
+        """Its angle."""
+        return float(np.linalg.norm(self.vector))
+
+
+def turn_of(start: np.ndarray, end: np.ndarray, velocity: np.ndarray) -> Turn:
+    """Return how a body turns whose points go from start to end, shape (n, dim) each.
+
+    Two places do not tell a body that flies and spins from one that turns about a pivot. The direction in which its
+    centre sets out does: that of its way, or in 2D half the angle from it. Between the two a part of the arc is taken,
+    beyond them all or nothing.
 
     Parameters
     ----------
     start, end : ndarray, shape (n, dim)
-        Where its points are, m.
+        m.
+    velocity : ndarray, shape (dim,)
+        Of its centre when it sets out, whatever its length.
     """
-    y0, y1 = start - start.mean(axis=0), end - end.mean(axis=0)
-    radius = float(np.sqrt(np.max(np.sum(y0**2, axis=1))))
-    angle = float(np.linalg.norm(_rotation_vector(y0, y1)))
-    return max(1, math.ceil(angle * math.sqrt(radius / (8.0 * slack))))
+    dim = start.shape[1]
+    vector = _rotation_vector(start - start.mean(axis=0), end - end.mean(axis=0))
+    angle = float(np.linalg.norm(vector))
+    way, sets_out = np.zeros((2, 3))
+    way[:dim], sets_out[:dim] = end.mean(axis=0) - start.mean(axis=0), velocity
+    straight = Turn(vector, np.zeros(dim))
+    if angle == 0.0:
+        return straight
+    axis = vector / angle
+    way, sets_out = (v - (v @ axis) * axis for v in (way, sets_out))
+    lengths = float(np.linalg.norm(way) * np.linalg.norm(sets_out))
+    if lengths == 0.0:
+        return straight
+    across = np.cross(axis, way)
+    before = float(sets_out @ -across) / lengths / math.sin(angle / 2.0)
+    arm = -0.5 * way - 0.5 / math.tan(angle / 2.0) * across
+    return Turn(vector, min(max(before, 0.0), 1.0) * arm[:dim])
 
 
-def stations(start: np.ndarray, end: np.ndarray, n: int) -> list[np.ndarray]:
+def straight_parts(start: np.ndarray, turn: Turn, slack: float) -> int:
+    """Return into how many straight ways that of a body must be divided, so that none is ``slack`` (m) off an arc.
+
+    An angle a leaves its chord by r a^2/8 at the distance r from what it is about.
+    """
+    radius = float(np.linalg.norm(start - start.mean(axis=0), axis=1).max()) + float(np.linalg.norm(turn.arm))
+    return max(1, math.ceil(turn.angle * math.sqrt(radius / (8.0 * slack))))
+
+
+def stations(start: np.ndarray, end: np.ndarray, turn: Turn, n: int) -> list[np.ndarray]:
     """Return where the points of a body are at n + 1 equal times, from start to end, shape (n_points, dim) each.
 
     The body turns about its centre by the rotation that fits best, evenly, and what it changes in shape in that time
-    it changes evenly, as seen by who turns with it.
+    it changes evenly, as seen by who turns with it. Its centre leaves its straight way as far as it turns, too.
     """
-    if n == 1:
-        return [start, end]
     from_centre, to_centre = start.mean(axis=0), end.mean(axis=0)
     y0, y1 = start - from_centre, end - to_centre
-    dim, turn = start.shape[1], _rotation_vector(y0, y1)
-    back = y1 @ _turned_by(turn)[:dim, :dim]
+    dim = start.shape[1]
+    whole = _turned_by(turn.vector)[:dim, :dim]
+    back = y1 + y1 @ whole
     between = []
     for part in np.arange(1, n) / n:
-        y = ((1.0 - part) * y0 + part * back) @ _turned_by(part * turn)[:dim, :dim].T
-        between.append((1.0 - part) * from_centre + part * to_centre + y)
+        change = _turned_by(part * turn.vector)[:dim, :dim]
+        y = (1.0 - part) * y0 + part * back
+        y += y @ change.T
+        off = (change - part * whole) @ turn.arm
+        between.append((1.0 - part) * from_centre + part * to_centre + off + y)
     return [start, *between, end]
 
 
@@ -139,11 +191,11 @@ def _rotation_vector(y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
 
 
 def _turned_by(turn: np.ndarray) -> np.ndarray:
-    """Return the rotation about an axis, given times its angle (Rodrigues)."""
+    """Return the rotation about an axis, given times its angle, less the identity (Rodrigues)."""
     angle = float(np.linalg.norm(turn))
     x, y, z = turn / angle if angle > 0.0 else turn
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return np.sin(angle) * cross + 2.0 * np.sin(0.5 * angle) ** 2 * cross @ cross
 
 
 def first_on_ways(one: Sequence[Way], other: Sequence[Way]) -> Meeting | None:

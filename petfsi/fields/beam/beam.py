@@ -216,6 +216,10 @@ class BeamSolid(NodalSolid):
         """Return the present positions of its points, shape (n_points, 2). Collective."""
         return self._outline(self._everywhere(self.displacement))
 
+    def surface_speed(self) -> np.ndarray:
+        """Return w of the step last accepted at the points of ``surface_present``. Collective."""
+        return self._at_points(self._solved())
+
     def surface_shift(self) -> np.ndarray:
         """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective."""
         return self._at_points(self._shift())

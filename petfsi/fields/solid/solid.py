@@ -165,6 +165,10 @@ class SimplexSolid(NodalSolid):
         """Return the present positions of its points, shape (n_points, dim). Collective."""
         return self._vertices(self.reference[self._wet] + self.displacement[self._wet])
 
+    def surface_speed(self) -> np.ndarray:
+        """Return w of the step last accepted at the points of ``surface_present``. Collective."""
+        return self._vertices(self._solved()[self._wet])
+
     def surface_shift(self) -> np.ndarray:
         """Return how far its points are moved from ``surface_positions`` to where w = 0 leads. Collective."""
         return self._gather_surface(self._shift()[self._wet])
