@@ -40,6 +40,8 @@ class EnergyGuard:
     ----------
     beyond : int
         How many of the last steps had too much.
+    doubt : str
+        What is wrong, if the last one had: a run may end before ``PATIENCE`` does.
     weight : float
         The largest weight so far of all that the fluid's box may hold, times the longest way it may fall, J (per m in
         2D): fluid at rest in a closed box exchanges nothing, and round-off moves it.
@@ -54,7 +56,7 @@ class EnergyGuard:
         self.notes = [] if scene.output.accounts or not asked else [f"time.energy_limit: {scene.unjudged}"]
         self._gravity, self._mass_way = _may_fall(scene)
         self._strained = _strained(scene)
-        self.beyond, self.weight = 0, 0.0
+        self.beyond, self.weight, self.doubt = 0, 0.0, ""
 
     def judge(self, accounts: Accounts, time: float, advice: str) -> None:
         """Raise if there is energy out of nothing. Not collective; all agree.
@@ -80,16 +82,22 @@ class EnergyGuard:
         stored = min(0.0, accounts.values.get("dissipated", 0.0))
         held, got = sum(parts.values()) + stored, accounts.exchanged
         most = (1.0 + self.limit) * got + ROUND_OFF * (got + self.weight) + self._strained
-        self.beyond = 0 if held <= most else self.beyond + 1
-        if not self._watches or self.beyond < PATIENCE:
+        self.beyond, self.doubt = 0 if held <= most else self.beyond + 1, ""
+        if not self._watches or not self.beyond:
             return
         grown = max(parts, key=lambda name: parts[name])
-        raise EnergyError(
+        self.doubt = (
             f"energy has come out of nothing, most of it {grown}: there are now "
             f"{', '.join(f'{name} {value:.3g} J' for name, value in parts.items())}; what it began with and what "
             f"gravity, loads and boundaries gave or took since, step by step, come to {got:.3g} J. {advice} "
             f"time.energy_limit = {self.limit:g} is how much more there may be, as a part of that; -1 lets all pass."
         )
+        if self.beyond >= PATIENCE:
+            raise EnergyError(self.doubt)
+
+    def last_doubt(self, step: int) -> str:
+        """Return what is wrong at the end of a run of so many steps that ends before that is sure, or nothing."""
+        return self.doubt if step > PATIENCE else ""
 
     def state(self) -> dict[str, Slab]:
         """Return what the next step is judged by, besides the accounts."""

@@ -299,7 +299,8 @@ class Simulation:
             self.fluid.accept(values.get(self.fluid.name, NOTHING), t, dt)
         if self.regions:
             self.regions.settle()
-        remarks = self.solid.remark(dt) if self.solid else None, self.fluid.remark() if self.fluid else None
+        remarks = [self.solid.remark(dt) if self.solid else None, self.fluid.remark() if self.fluid else None]
+        remarks.append(self.splitting.doubt if self.splitting else None)
         for remark in filter(None, remarks):
             self.report(f"t = {t + dt:.6g} s: {remark}")
         self.accounts.update(values.get(self.fluid.name) if self.regions and self.fluid else None, dt)

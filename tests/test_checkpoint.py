@@ -110,7 +110,7 @@ DAMAGE = {
     damage_sidecar: r"000010\.json is missing; writing it was interrupted",
     damage_sidecar_text: r"000010\.json is not readable",
     damage_file: r"000010\.h5 is missing",
-    damage_format: r"000010\.json is of format 99, by petfsi .*; this one reads format 5",
+    damage_format: r"000010\.json is of format 99, by petfsi .*; this one reads format 6",
 }
 
 

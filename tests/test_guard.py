@@ -65,6 +65,16 @@ def test_a_run_that_goes_on_stops_as_one_that_never_stopped():
         assert until_it_stops(straight) == until_it_stops(again)
 
 
+def test_a_run_that_ends_with_too_much_says_so(tmp_path, capfd):
+    """Three steps must have too much for a stop; the last one or two are told of."""
+    with prepared(spinning(), comm=COMM) as sim:
+        n, _ = until_it_stops(sim)
+    with only_options([]):
+        for steps, told in ((n, True), (3, False)):
+            assert run_scene(spinning(), tmp_path / str(steps), steps, [], None, overwrite=False) == 0
+            assert ("warning: in the last step energy has come out of nothing" in capfd.readouterr().out) == told
+
+
 def test_a_splitting_scheme_is_told_what_to_try():
     with prepared(loaded(JOBS / "column.toml"), *SPLIT) as sim:
         n, why = until_it_stops(sim)

@@ -163,7 +163,7 @@ REFUSED = {
     "a pipe for a history": (lambda r: piped(r / "history.csv"), "history.csv is not the one"),
     "output elsewhere": (lambda r: linked_directory(r / "fields"), "run/fields is a link, and petfsi follows none"),
     "checkpoints elsewhere": (lambda r: linked_directory(r / "checkpoint"), "run/checkpoint is a link"),
-    "an older format": (of_old_format, "is of format 3, by petfsi 0.0.9; this petfsi goes on with format 5 alone"),
+    "an older format": (of_old_format, "is of format 3, by petfsi 0.0.9; this petfsi goes on with format 6 alone"),
 }  # fmt: skip
 
 #: By name what is done to a stopped run that goes on, and what is told (nothing: "").

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from petfsi.output.files import digest_of
 
 #: Of the layout of a run directory and its checkpoints; raised when an older petfsi could not read it.
-FORMAT = 5
+FORMAT = 6
 #: What is longer is no manifest, bytes.
 MAX_BYTES = 1 << 24
 #: How every manifest begins.

@@ -134,6 +134,9 @@ class Run:
         summary = self.summary(status, why)
         write_summary(self.files.summary, summary, self.comm)
         self.tell(self.console.note, summary)
+        doubt = self.simulation.guard.last_doubt(step)
+        if doubt:
+            self.console.warn(f"in the last step {doubt}")
         if status == "done":
             return DONE
         self.console.note(f"stopped by {why} after step {step}; go on with: petfsi resume {self.files.path}")

@@ -17,6 +17,10 @@ from petfsi.solving.system import System
 RISE = 1.5
 #: In so many steps running.
 PATIENCE = 3
+#: Slow growth is told of after so many steps in each of which what is left has turned round and has grown at all; where
+#: something else fails, fewer of them say that splitting is the cause. It does not stop a run: what a load leaves that
+#: turns round in every step, and grows, does so, too.
+LONG, SOME = 10, 5
 #: What is left points the other way than before if the cosine between the two is below this; where the scheme is
 #: unstable it is about -1. What loads leave that set in smoothly points the same way.
 TURNED = -0.5
@@ -42,10 +46,16 @@ class SplitWatch:
     solid : SolidField
     stops : bool
         Whether such a run is stopped, before an element is turned inside out.
+
+    Attributes
+    ----------
+    doubt : str
+        What a user should know of the last step: once, that what is left has long turned round and grown.
     """
 
     def __init__(self, comm: MPI.Comm, solid: SolidField, stops: bool) -> None:
         self._comm, self._solid, self._stops = comm, solid, stops
+        self.doubt, self._told = "", False
         self.forget()
 
     def forget(self) -> None:
@@ -53,6 +63,8 @@ class SplitWatch:
         # by body what the last steps left, the last one's last, as far back as each left more than the one before it,
         # and more than its |b|; zeros before
         self._left = np.zeros((len(self._solid.names), 1 + PATIENCE))
+        # by body in how many of the last steps what is left has turned round and grown
+        self._turns = np.zeros(len(self._solid.names))
         self._residual = np.zeros(self._solid.layout.n_local)
 
     @property
@@ -79,9 +91,13 @@ class SplitWatch:
         last = self._left[:, -1]
         goes_on = turned & (last > 0) & (left > np.maximum(size, RISE * last))
         self._left = np.column_stack((np.where(goes_on[:, None], self._left[:, 1:], 0.0), left))
+        self._turns = np.where(turned & (left > before), self._turns + 1.0, 0.0)
         self._residual = r.copy()
         if self._stops and self.rises.max() >= PATIENCE:
             raise FinalError(self.story())
+        self.doubt = ""
+        if not self._told and np.any((self._turns >= LONG) & (left > size)):
+            self.doubt, self._told = self.story(), True
 
     def _by_body(self, values: np.ndarray) -> np.ndarray:
         """Return the sum over this rank's unknowns of each body."""
@@ -93,30 +109,35 @@ class SplitWatch:
         Risen once may be what another body sets off that meets something, which then leaves more.
         """
         rises, left = self.rises, self._left[:, -1]
-        counts = (rises > 1) | ((rises == 1) & (left == left.max()))
+        counts = (rises > 1) | ((rises == 1) & (left == left.max())) | (self._turns >= SOME)
         if not counts.any():
             return ""
-        worst = int(np.lexsort((left, rises, counts))[-1])  # of those that rose most often what left most
-        n = int(rises[worst])
-        name, first = self._solid.names[worst], self._left[worst, -1 - n]
+        worst = int(np.lexsort((left, self._turns, rises, counts))[-1])  # of those that rose most often what left most
+        n, turns = int(rises[worst]), int(self._turns[worst])
+        grown = f"has turned round in each of the last {turns} steps, and grown, to {left[worst]:.1e}"
+        if n:
+            first = self._left[worst, -1 - n]
+            grown = f"has risen from {first:.1e} to {left[worst]:.1e} in {n} step{'s' * (n > 1)}"
         return (
-            f"time splitting is unstable here: what it leaves over in the equations of solids.{name}, |b - Kx|, has "
-            f"risen from {first:.1e} to {left[worst]:.1e} in {n} step{'s' * (n > 1)}. More fluid moves with the "
-            f"solid, or with a part of its surface, than that weighs (added mass), and smaller steps make that worse. "
+            f"time splitting is unstable here: what it leaves over in the equations of solids."
+            f"{self._solid.names[worst]}, |b - Kx|, {grown}. More fluid moves with the solid, or with a part of its "
+            f"surface, than that weighs (added mass), and smaller steps make that worse. "
             f"Start again with -options_file monolithic.opts; split-iterated.opts holds only where the solid's "
             f"stiffness and damping in a step outweigh that fluid"
         )
 
     def keep(self) -> Callable[[], State]:
         """Return what gives the state of now, by which the next step is judged; that is collective."""
-        left, residual = self._left, self._residual  # each step makes new ones
-        mine = left if self._comm.rank == 0 else left[:0]
-        slab = Slab(mine, (len(left) - len(mine), 0), left.shape)
+        residual = self._residual  # each step makes a new one
+        table = np.column_stack((self._left, self._turns))
+        mine = table if self._comm.rank == 0 else table[:0]
+        slab = Slab(mine, (len(table) - len(mine), 0), table.shape)
         return lambda: {"left_by_body": slab, **self._solid.stored("residual", residual)}
 
     def restore(self, read: Reader) -> None:
         """Take the state back. Collective."""
-        left = np.asarray(read("left_by_body", (0, 0), self._left.shape), dtype=float)
+        n, width = self._left.shape
+        table = np.asarray(read("left_by_body", (0, 0), (n, width + 1)), dtype=float)
         residual = self._solid.read_stored(read, "residual")
-        refuse(self._comm, [outside("left_by_body", left, 0.0, MOST), outside("residual", residual, -MOST, MOST)])
-        self._left, self._residual = left, residual
+        refuse(self._comm, [outside("left_by_body", table, 0.0, MOST), outside("residual", residual, -MOST, MOST)])
+        self._left, self._turns, self._residual = table[:, :-1], table[:, -1], residual
