@@ -198,9 +198,14 @@ def _jets(scene: Scene, inflows: list[tuple[str, Inflow]]) -> Problems:
             allowed = "smoke needs a table [fluid.smoke] (it may be empty)"
             yield Problem(f"fluid.sides.{side}.inflow.smoke", inflow.smoke, allowed, ("fluid.smoke",))
     leaves = any(open_side(form) is not None for _, form in fluid.sides)
-    if len(inflows) == 1 and not leaves and not scene.solids:
+    if len(inflows) == 1 and not leaves and not scene.solids and not _varies_along(inflows[0][1]):
         allowed = 'what flows in must be able to leave: make a side open, or set rest = "open" here'
         yield Problem(f"fluid.sides.{inflows[0][0]}.inflow", ABSENT, allowed, ("fluid.sides", "solids"))
+
+
+def _varies_along(inflow: Inflow) -> bool:
+    """Return whether a jet's speed depends on the place: one part of its side may draw out what another lets in."""
+    return not Expression(inflow.speed).names.isdisjoint("xyz")
 
 
 # ---- obstacles ----------------------------------------------------------------------------------------------

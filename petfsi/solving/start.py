@@ -7,6 +7,7 @@ import numpy as np
 from petfsi.errors import SolveError
 from petfsi.fields.fluids import PressureFluid
 from petfsi.fields.solids import SolidField
+from petfsi.solving.balance import Balance
 from petfsi.solving.linear import LinearSolver
 from petfsi.solving.option_database import only_options
 from petfsi.solving.regions import ClosedRegions
@@ -107,6 +108,8 @@ def _change(
         solid.rhs += pull
     system.refresh()
     system.solution.set(0.0)
+    if regions is not None and Balance(regions).make_up():
+        system.refresh(guess=False)
     _solve(system, solver, regions, fluid)
     changes = dict(zip((field.name for field in system.fields), system.values(), strict=True))
     if solid is not None:
