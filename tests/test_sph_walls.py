@@ -383,7 +383,7 @@ def test_a_box_that_is_larger_than_the_fluids_is_told():
     ]
     assert found.volume.sum() == pytest.approx(0.7)
     found = liquid(room, DX, [block([-0.001, 0.1 * n], [0.2, 0.1]) for n in range(10)], {}, HERE)
-    assert len(found.notes) == 7 and found.notes[-1] == "fluid.fill: of 4 more boxes only a part is filled"
+    assert len(found.notes) == 7 and found.notes[-1] == "fluid.fill: of 4 more shapes only a part is filled"
     assert liquid(room, DX, [block([0.0, 0.7], [1.0, 1.0])], {}, HERE).notes == []
 
 
@@ -392,7 +392,7 @@ def test_boxes_beyond_the_fluids_are_counted_not_their_axes():
     told = [note for note in liquid(domain(10, 10), DX, corner, {}, HERE).notes if "places" not in note]
     assert [note.split()[0] for note in told] == [*(f"fluid.fill.{n}" for n in range(6)), "fluid.fill:"]
     assert told[0].count("what lies in that is filled") == 2
-    assert told[-1] == "fluid.fill: of 1 more box only a part is filled"
+    assert told[-1] == "fluid.fill: of 1 more shape only a part is filled"
 
 
 def test_what_is_outside_is_dropped_and_counted():
@@ -404,6 +404,19 @@ def test_what_is_outside_is_dropped_and_counted():
     assert found.notes == ["fluid.fill: 16 places lie outside the box"]
     found = liquid(room, DX, [Shape(halfspace={"point": [0.0, 0.3], "normal": [0.0, 1.0]})], {}, HERE)
     assert (len(found.x), found.outside) == (30, 0)
+
+
+@pytest.mark.parametrize("sides", [("slip", "slip"), ("periodic", "periodic")])
+def test_what_is_far_larger_than_the_fluids_box_fills_it(sides, tmp_path):
+    """In time and memory of the fluid's places, as files in other units than the scene's would take those of theirs."""
+    square = tmp_path / "square.vtk"
+    corners = [[-1e5, -1e5, 0.0], [2e5, -1e5, 0.0], [2e5, 0.7, 0.0], [-1e5, 0.7, 0.0]]
+    meshio.Mesh(corners, [("line", [[0, 1], [1, 2], [2, 3], [3, 0]])]).write(square)
+    room = domain(10, 10, sides=(sides, ("slip", "slip")))
+    for shape in (Shape(mesh=str(square)), Shape(ball={"centre": [0.5, 0.7 - 1e7], "radius": 1e7})):
+        found = liquid(room, DX, [shape], {}, HERE)
+        assert (len(found.x), found.outside) == (70, 0)
+        assert len(found.notes) == 1 and "what lies in that is filled" in found.notes[0]
 
 
 def test_a_cylinder_is_filled():

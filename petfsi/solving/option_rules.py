@@ -154,6 +154,9 @@ def _unsuitable(name: str, value: str) -> str:
             bool(_FLAG.fullmatch(value)),
             "no value: a file is refused, as it may lie outside the run directory",
         )
+    elif "monitor" in name.split("_"):
+        # PETSc calls what is not there for other formats
+        good, wanted = bool(_FLAG.fullmatch(value) or value.lower() == "ascii"), f"no value, or ascii: {_NO_FILE}"
     elif set(name.split("_")) & _SPEAKS:
         numeric = bool(_NUMBER.fullmatch(value))
         good = bool(_FLAG.fullmatch(value) or _SCREEN.fullmatch(value)) or (numeric and not name.endswith("view"))

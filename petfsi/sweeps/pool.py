@@ -53,8 +53,8 @@ class Pool:
     """Runs what has no result yet. ``work`` returns why it stopped before all had one, or nothing.
 
     Runs are taken in rounds of ``repeat``, those of many ranks first; while one waits for cores, smaller ones of its
-    round alone go before it. What another process is at is waited for, and
-    what it leaves is taken over; its ranks count among those at work.
+    round alone go before it. What another process is at is waited for, and what it leaves is taken over; its ranks
+    count among those at work.
 
     Parameters
     ----------

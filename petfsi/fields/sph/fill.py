@@ -30,8 +30,10 @@ FINE = {2: 6, 3: 4}
 LINKED = 1.5
 #: Something nearer than this, in dx, to what is dx above a particle is right above it.
 BLOCKED = 0.75
-#: Of so many boxes it is told that they do not fit into the fluid's.
+#: Of so many shapes it is told that they do not fit into the fluid's box.
 TOLD = 6
+#: What has so many times the fluid's places is laid out in the fluid's box alone; what is beyond is not counted.
+FAR = 1e3
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Fill:
     clearance : float
         How far particles keep off them, m.
     cut : list of str
-        A line for each box that reaches beyond the domain, or is longer than a period: what of it is filled.
+        A line for each box that reaches beyond the domain, or is longer than a period, and for what reaches far beyond:
+        what of it is filled.
     """
 
     x: Array
@@ -70,7 +73,7 @@ class Fill:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know of particles that were dropped, and of boxes of which only a part is filled."""
+        """What a user should know of particles that were dropped, and of shapes of which only a part is filled."""
         told = {
             "lie outside the box": self.outside,
             "lie in obstacles or solids, or less than half a spacing before them": self.blocked,
@@ -79,7 +82,7 @@ class Fill:
         said = [f"fluid.fill: {n} places {what}" for what, n in told.items() if n] + self.cut[:TOLD]
         more = len(self.cut) - TOLD
         if more > 0:
-            said.append(f"fluid.fill: of {more} more box{'es' * (more > 1)} only a part is filled")
+            said.append(f"fluid.fill: of {more} more shape{'s' * (more > 1)} only a part is filled")
         return said
 
     def is_solid(self, points: Array) -> Array:
@@ -139,24 +142,25 @@ def liquid(
         found.append((x, volume, np.full(len(x), number)))
     x, volume, which = (np.concatenate(part) for part in zip(*found, strict=True))
     outside, blocked, double = dropped.tolist()
-    parts = {f"fluid.fill.{number}": "; ".join(_cut(shape, domain)) for number, shape in enumerate(shapes)}
+    parts = {f"fluid.fill.{number}": "; ".join(_cut(lattice)) for number, lattice in enumerate(lattices)}
     cut = [f"{key} {said}" for key, said in parts.items() if said]
     return Fill(x, volume, which, outside, blocked, double, domain, solids, clearance * dx, cut)
 
 
-def _cut(shape: Shape, domain: Domain) -> Iterator[str]:
-    """Say what is filled of a box along each axis on which it reaches beyond the domain or is longer than a period."""
-    if shape.box is None:
+def _cut(lattice: _Lattice) -> Iterator[str]:
+    """Say what is filled of a box, or of what reaches far, along each axis on which it is beyond the domain's."""
+    domain, region = lattice.domain, lattice.region
+    if region.reach is None or not (region.shape.box is not None or lattice.far):
         return
-    for a, (begin, size) in enumerate(zip(shape.box.origin, shape.box.size, strict=True)):
+    for a, (begin, end) in enumerate(zip(*region.reach, strict=True)):
         low, high = domain.low[a], domain.high[a]
         slack, axis = SAME * (high - low), "xyz"[a]
         if domain.periodic[a]:
-            if size > high - low + slack:
+            if end - begin > high - low + slack:
                 repeats = f"which repeats after {high - low:g} m"
-                yield f"is {size:g} m long along {axis}, {repeats}: that is filled once"
-        elif begin < low - slack or begin + size > high + slack:
-            reach = f"{axis} from {begin:g} to {begin + size:g} m"
+                yield f"is {end - begin:g} m long along {axis}, {repeats}: that is filled once"
+        elif begin < low - slack or end > high + slack:
+            reach = f"{axis} from {begin:g} to {end:g} m"
             yield f"has {reach}, the fluid's box from {low:g} to {high:g} m: what lies in that is filled"
 
 
@@ -202,6 +206,8 @@ class _Lattice:
         Whether these are not the domain's.
     outside : int
         How many cells of a box are beyond the domain.
+    far : bool
+        Whether the shape has no cells beyond the domain, as they would be too many.
     """
 
     def __init__(self, shape: Shape, domain: Domain, dx: float, key: str, directory: Path) -> None:
@@ -212,11 +218,15 @@ class _Lattice:
         self.region, self.domain, self.dx = Region(shape, surface, domain), domain, dx
         self.rows, self.width, self.own, self.outside = [], domain.spacing(dx), False, 0
         reach, whole, inner = self.region.reach, 1.0, 1.0
+        times = 1.0 if reach is None else np.prod((reach[1] - reach[0]) / (domain.high - domain.low))
+        self.far = shape.box is None and bool(times > FAR)
         for a in range(dim):
             low, high, h = domain.low[a], domain.high[a], self.width[a]
             begin, end = (low, high) if reach is None else (reach[0][a], reach[1][a])
             if domain.periodic[a] and (shape.box is None or end - begin >= high - low):
                 begin, end = low, high
+            elif self.far and not domain.periodic[a]:
+                begin, end = max(begin, low), min(end, high)
             first, last = (begin - low) / h, (end - low) / h
             fits = np.abs(np.rint([first, last]) - [first, last]).max() < SAME
             if shape.box is not None:
