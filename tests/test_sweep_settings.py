@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import meshio
@@ -92,6 +93,20 @@ def test_an_edited_input_is_refused_by_name(sweep, name):  # noqa: F811
         assert done.returncode == 2 and f"{path} has been changed since it was planned" in done.stderr
     path.unlink()
     assert sweep("out").returncode == 2 and sweep("s.toml", "--out", "out").returncode == 0
+
+
+def test_an_edited_mesh_is_refused_by_name(sweep):  # noqa: F811
+    for name in ("block.node", "block.ele"):
+        Path(name).write_text(name)
+    Path("scene.toml").write_text(re.sub("shape = .*", 'shape = { mesh = "block.node" }', SCENE))
+    folder, plan = made("a", "b")
+    folder.check_inputs(plan.runs)
+    path = next(Path("out/inputs/meshes").glob("*/block.ele"))
+    path.write_text("other")
+    done = sweep("out")
+    assert done.returncode == 2 and f"{path.parent} holds another mesh than when it was planned" in done.stderr
+    shutil.rmtree(path.parent)
+    assert sweep("s.toml", "--out", "out").returncode == 0
 
 
 @pytest.mark.parametrize("key, value", [("axes", {"how": "b"}), ("options", ["-fsi_ksp_max_it", "3"]), ("steps", 3)])

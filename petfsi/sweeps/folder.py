@@ -18,10 +18,11 @@ import petfsi
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.output import files
-from petfsi.output.mesh_files import copy_mesh
+from petfsi.output.mesh_files import copy_mesh, mesh_files
+from petfsi.scene.load import load_scene
 from petfsi.sweeps.attempts import NAME as ATTEMPTS
 from petfsi.sweeps.claim import NAME as CLAIM
-from petfsi.sweeps.plan import INPUTS, Plan, Planned, digest_of
+from petfsi.sweeps.plan import INPUTS, Plan, Planned, digest_of, mesh_folders
 
 #: Marks a folder as a sweep's.
 MARKER, FORMAT = ".petfsi-sweep", 1
@@ -34,6 +35,7 @@ RUNS, REPLACED = "runs", "replaced"
 _MOST = 16_000_000
 #: Runs, and keys of each, that a message names.
 _TOLD, _KEYS = 8, 6
+_MESH = re.compile(r'"(meshes/[^"]+)"')
 #: At the end of the name of an input, what its content is.
 _DIGEST = re.compile(r"-([0-9a-f]{12})\.(?:toml|opts)$")
 
@@ -170,7 +172,7 @@ class SweepFolder:
                     raise InputError(f"{self.path / name} is {kind}; a sweep writes there: put a {what} in its place")
 
     def check_inputs(self, runs: Sequence[Planned]) -> None:
-        """Raise InputError, by name, of a scene or an options file that is not what its name says that it is."""
+        """Raise InputError, by name, of a scene, an options file or a mesh that is not what its name says."""
         names = [name for run in runs for name in (Path(run.scene).name, *run.options)]
         for name in dict.fromkeys(names):
             digest = _DIGEST.search(name)
@@ -182,10 +184,26 @@ class SweepFolder:
             except OSError as error:
                 why = f"cannot be read: {files.reason(error)}"
             if why:
-                raise InputError(
-                    f"{self.inputs / name} {why}, or remove it, and it is written anew by: petfsi sweep SWEEP.toml "
-                    f"--out {self.path}"
-                )
+                raise self._unfit(self.inputs / name, why)
+        self._check_meshes(runs)
+
+    def _check_meshes(self, runs: Sequence[Planned]) -> None:
+        """Raise InputError of a mesh that has changed; one that several scenes have is looked at once."""
+        seen: set[str] = set()
+        for run in runs:
+            named = {mesh for value in run.settings().values() for mesh in _MESH.findall(value)}
+            if named <= seen:
+                continue
+            seen |= named
+            for folder, together in mesh_folders(mesh_files(load_scene(self.path / run.scene))):
+                place = together[0].source.parent
+                if place.name != Path(folder).name:
+                    raise self._unfit(place, "holds another mesh than when it was planned; put it back")
+
+    def _unfit(self, path: Path, why: str) -> InputError:
+        return InputError(
+            f"{path} {why}, or remove it, and it is written anew by: petfsi sweep SWEEP.toml --out {self.path}"
+        )
 
     @contextmanager
     def alone(self) -> Iterator[None]:

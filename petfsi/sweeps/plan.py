@@ -236,13 +236,8 @@ class _Planner:
 
     def _copied(self, meshes: list[MeshFile]) -> dict[str, str]:
         """Return new names of mesh files by their paths; files that belong together stay in a folder of their own."""
-        folders: dict[str, list[MeshFile]] = {}
-        for mesh in meshes:
-            folders.setdefault(os.path.dirname(mesh.mark.file), []).append(mesh)
         names = {}
-        for together in folders.values():
-            digests = json.dumps([mesh.mark.blake2b for mesh in together])
-            folder = f"meshes/{digest_of(digests.encode())}"
+        for folder, together in mesh_folders(meshes):
             for mesh in together:
                 names[os.path.abspath(mesh.source)] = f"{folder}/{mesh.source.name}"
                 self.plan.meshes[f"{folder}/{mesh.source.name}"] = mesh
@@ -324,6 +319,16 @@ def scene_name(text: bytes) -> str:
 def digest_of(data: bytes) -> str:
     """Return what stands for some bytes in the name of a file."""
     return hashlib.sha256(data).hexdigest()[:_DIGITS]
+
+
+def mesh_folders(meshes: list[MeshFile]) -> Iterator[tuple[str, list[MeshFile]]]:
+    """Yield the folders among the inputs, each with the mesh files that belong together: others have another name."""
+    folders: dict[str, list[MeshFile]] = {}
+    for mesh in meshes:
+        folders.setdefault(os.path.dirname(mesh.mark.file), []).append(mesh)
+    for together in folders.values():
+        digests = json.dumps([mesh.mark.blake2b for mesh in together])
+        yield f"meshes/{digest_of(digests.encode())}", together
 
 
 def settings_of(scene: str) -> dict[str, str]:
