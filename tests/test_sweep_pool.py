@@ -337,3 +337,14 @@ def test_the_time_left_counts_ranks_and_cores():
     for ranks, cores, seconds in ((1, 1, 20), (1, 2, 10), (1, 8, 10), (2, 2, 20), (4, 2, 20)):
         left = command._time_left(looks, {"a": 1, "b": ranks, "c": ranks}, cores)
         assert left.startswith(f"; about {seconds} s left here"), (ranks, cores, left)
+
+
+def test_the_time_left_counts_the_start_of_a_process(tmp_path):
+    for seconds in (4.0, 6.0):
+        attempts.began(tmp_path, "run", -1, 0)
+        attempts.ended(tmp_path, 0, seconds, 1, False, 0)
+    done = Look("done", "", 1, summary={"wall_s": 1.0}, attempts=attempts.read_attempts(tmp_path))
+    looks = {"a": done, "b": Look("new", "", -1)}
+    assert command._time_left(looks, {"a": 1, "b": 1}, 1).startswith("; about 10 s left")
+    done.attempts[0].seconds = None  # whoever started it was killed
+    assert command._time_left(looks, {"a": 1, "b": 1}, 1).startswith("; about 1 s left")

@@ -29,6 +29,7 @@ def edited(folder, old, changes):
     [
         {"options": ["--out", "../../elsewhere", "--overwrite"]},
         {"options": ["-options_file", "../../mine.opts"]},
+        {"options": ["-Options_File", "../../mine.opts"]},
         {"options": [1]},
         {"scene": "../scene.toml"},
         {"scene": "inputs/../../scene.toml"},

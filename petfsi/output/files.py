@@ -50,7 +50,7 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
         Of a link, a folder, a pipe or a device, with ``filename``, and of whatever else hinders.
     """
     # without O_NONBLOCK to open a pipe would wait for its other end
-    handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+    handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
         raise OSError(errno.EINVAL, _NO_FILE, str(path))

@@ -36,7 +36,8 @@ TAKING = f"{NAME}.taking"
 BEAT = 10.0
 _TRIES = 20
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
-_MAX_BYTES = 4096
+#: Of a lock.
+MAX_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -265,7 +266,7 @@ def _open_old(path: Path) -> int | None:
 def _judge(path: Path, old: int) -> None:
     """Raise InputError unless the process that a lock names is gone, or the lock is; takes ``flock`` on it."""
     free = _flock(old)
-    holder = Holder.read(os.pread(old, _MAX_BYTES, 0))
+    holder = Holder.read(os.pread(old, MAX_BYTES, 0))
     if free is False or holder is None or not (holder.here and holder.gone()):
         if _same(path, old):
             raise InputError(_at_work(path, holder, os.fstat(old).st_mtime, free))

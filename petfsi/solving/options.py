@@ -14,6 +14,8 @@ from petfsi.solving.option_rules import AT_START, PREFIX, fault, shown
 DEFAULT = "monolithic.opts"
 COMMAND_LINE, ENVIRONMENT = "command line", "PETSC_OPTIONS"
 FILE = "options_file"
+#: In a run's directory: what ``Options.dump`` says.
+STORED = "options.opts"
 #: Bytes of an options file, options in all, and files that name each other.
 LARGEST_FILE, MOST, DEEPEST = 1_000_000, 1000, 10
 #: Mistakes and names told at once.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import time
@@ -34,6 +35,8 @@ class Attempt:
         Whether it was told to stop: then it says nothing about the run that it did not get further.
     peak_kb : int
         Of the memory of its largest process.
+    seconds : float or None
+        From its start to its end; None as for ``exit``.
     """
 
     step: int
@@ -42,6 +45,7 @@ class Attempt:
     exit: int | None = None
     told: bool = False
     peak_kb: int = 0
+    seconds: float | None = None
 
 
 def read_attempts(path: Path) -> list[Attempt]:
@@ -60,8 +64,8 @@ def read_attempts(path: Path) -> list[Attempt]:
                 found.append(Attempt(int(entry["step"]), str(entry["how"]), int(entry.get("output", 0))))
             elif found:
                 found[-1].exit, found[-1].told = int(entry["exit"]), bool(entry["told"])
-                found[-1].peak_kb = int(entry["peak_kb"])
-        except (ValueError, TypeError, KeyError, RecursionError):
+                found[-1].peak_kb, found[-1].seconds = int(entry["peak_kb"]), _seconds(entry)
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
             continue
     return found
 
@@ -83,12 +87,17 @@ def again(path: Path, state: str) -> None:
     _append(path, {"time": _now(), "retry": state})
 
 
+def _seconds(entry: dict[str, Any]) -> float | None:
+    seconds = float(entry.get("seconds", math.nan))
+    return seconds if 0 <= seconds < math.inf else None
+
+
 def _now() -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")
 
 
 def _append(path: Path, entry: dict[str, Any]) -> None:
-    handle = os.open(path / NAME, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    handle = files.open_plain(path / NAME, os.O_RDWR | os.O_APPEND | os.O_CREAT)
     try:
         data = (json.dumps(entry) + "\n").encode()
         size = os.fstat(handle).st_size

@@ -13,8 +13,9 @@ import time
 from pathlib import Path
 
 from petfsi.errors import InputError
+from petfsi.output import files
+from petfsi.output.lock import MAX_BYTES, Holder, refuse_if_held
 from petfsi.output.lock import NAME as LOCK
-from petfsi.output.lock import Holder, refuse_if_held
 
 NAME = ".claim"
 #: How often a claim is tried: who only looks whether there is one holds it for a moment.
@@ -28,7 +29,7 @@ def claim(path: Path) -> int | None:
     directory's lock alone keeps two processes apart.
     """
     try:
-        handle = os.open(path / NAME, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        handle = files.open_plain(path / NAME, os.O_RDWR | os.O_CREAT)
     except FileNotFoundError:
         return None
     try:
@@ -73,7 +74,7 @@ def give_back(handle: int) -> None:
 def is_busy(path: Path) -> bool:
     """Return whether a run is claimed, or a process is at work in it."""
     try:
-        handle = os.open(path / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        handle = files.open_plain(path / NAME)
     except OSError:
         return bool(at_work(path))
     claimed = _flock(handle, fcntl.LOCK_SH) is False
@@ -84,7 +85,7 @@ def is_busy(path: Path) -> bool:
 def is_elsewhere(path: Path) -> bool:
     """Return whether the lock of a run's directory is that of a process on another machine."""
     try:
-        holder = Holder.read((path / LOCK).read_bytes())
+        holder = Holder.read(files.read_plain(path / LOCK, MAX_BYTES))
     except OSError:
         return False
     return holder is not None and not holder.here

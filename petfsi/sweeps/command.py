@@ -14,11 +14,11 @@ from petfsi.messages import shown
 from petfsi.output import files
 from petfsi.sweeps import attempts
 from petfsi.sweeps.claim import claim, give_back, is_busy
-from petfsi.sweeps.folder import SweepFolder, describe_changed
+from petfsi.sweeps.folder import RUNS, SweepFolder, describe_changed
 from petfsi.sweeps.plan import Plan, Planned, plan_sweep
 from petfsi.sweeps.pool import Pool
 from petfsi.sweeps.selection import select
-from petfsi.sweeps.states import RESULTS, STATES, Look, look_at
+from petfsi.sweeps.states import LEFT_ALONE, RESULTS, STATES, Look, look_at
 from petfsi.sweeps.table import collect
 
 DONE, LEFT, INTERRUPTED = 0, 1, 75
@@ -79,14 +79,26 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
         return _say_states(folder, runs, chosen, cores, say, whole=True)
     if not wanted.collect:
         _check_launcher(chosen)
+        folder.check_ours(runs)
     if plan is not None:
         _make(folder, plan, wanted, say)
     if wanted.collect:
         rows = collect(folder, runs)
         say(f"{folder.table}: {len(rows)} runs")
+        _say_left_over(folder, runs, say)
         return DONE
-    if wanted.retry and wanted.retry != "changed":
+    folder.check_inputs(chosen)
+    if wanted.retry:
+        if wanted.retry == "changed" and plan is None and not _renewed(folder, plan, chosen, wanted.retry):
+            raise InputError("no run here is other than planned; what the sweep's file changes needs that file")
         _retry(folder, chosen, wanted.retry, wanted.anew, say)
+    return _work(folder, runs, chosen, cores, say)
+
+
+def _work(
+    folder: SweepFolder, runs: Sequence[Planned], chosen: Sequence[Planned], cores: int, say: Callable[[str], None]
+) -> int:
+    """Run what has no result, say how it ended and write the table; return the exit status."""
     if os.environ.get("PETSC_OPTIONS"):
         say("PETSC_OPTIONS is set, and not read: what a run hangs on stands in the sweep's file")
     why = Pool(folder, chosen, cores, say).work()
@@ -118,8 +130,6 @@ def _open(wanted: Wanted) -> tuple[SweepFolder, Plan | None]:
     if wanted.target.is_dir():
         if wanted.out is not None:
             raise InputError("--out is for a sweep's file: a folder stays where it is, and can be moved as a whole")
-        if wanted.retry == "changed":
-            raise InputError("--retry changed needs the sweep's file, which says what is to be run instead")
         return SweepFolder.open(wanted.target), None
     plan = plan_sweep(wanted.target)
     folder = SweepFolder(wanted.out or Path("runs") / wanted.target.stem)
@@ -156,9 +166,6 @@ def _make(folder: SweepFolder, plan: Plan, wanted: Wanted, say: Callable[[str], 
     for run in plan.runs:
         if run.name in changed:
             _set_aside(folder, run, say)
-    if left := folder.left_over(plan.runs):
-        names = ", ".join(left[:_TOLD]) + " ..." * (len(left) > _TOLD)
-        say(f"{len(left)} runs in {folder.path} are in the sweep's file no more, and stay as they are: {names}")
 
 
 def _set_aside(folder: SweepFolder, run: Planned, say: Callable[[str], None]) -> None:
@@ -176,12 +183,12 @@ def _at_work(folder: SweepFolder, name: str) -> str:
 
 
 def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, anew: bool, say: Callable[[str], None]) -> None:
-    """Let runs of a state be tried again: failed ones from their start, others from where they are, unless anew."""
+    """Let runs of a state be tried again: failed and changed ones from their start, others go on, unless anew."""
     for run in chosen:
         path = folder.run(run.name)
         if look_at(path, run).state != state:
             continue
-        if state == "failed" or anew:
+        if state in ("failed", "changed") or anew:
             _set_aside(folder, run, say)
         else:
             attempts.again(path, state)
@@ -189,9 +196,8 @@ def _retry(folder: SweepFolder, chosen: Sequence[Planned], state: str, anew: boo
 
 def _renewed(folder: SweepFolder, plan: Plan | None, chosen: Sequence[Planned], retry: str | None) -> set[str]:
     """Return the names of runs that ``--retry`` lets begin again."""
-    if retry == "changed":
-        return set() if plan is None else set(folder.changed(plan))
-    return {run.name for run in chosen if retry and look_at(folder.run(run.name), run).state == retry}
+    others = set(folder.changed(plan)) if retry == "changed" and plan is not None else set()
+    return others | {run.name for run in chosen if retry and look_at(folder.run(run.name), run).state == retry}
 
 
 def _chosen(wanted: Wanted, runs: Sequence[Planned]) -> list[Planned]:
@@ -207,7 +213,7 @@ def _check_launcher(runs: Sequence[Planned]) -> None:
 
 def _code(folder: SweepFolder, chosen: Sequence[Planned]) -> int:
     states = {look_at(folder.run(run.name), run).state for run in chosen}
-    if states & {"lost", "refused"}:
+    if states & set(LEFT_ALONE):
         return LEFT
     return DONE if states <= set(RESULTS) else INTERRUPTED
 
@@ -224,6 +230,13 @@ def _say_plan(folder: SweepFolder, chosen: Sequence[Planned], renewed: set[str],
         anew = ", to be run again" * (run.name in renewed)
         say(f"{run.name}  {state}{anew}, {run.ranks} rank{'s' * (run.ranks > 1)}")
     say(f"{len(chosen)} runs in {folder.path}: {_counts(states)}; nothing was written")
+
+
+def _say_left_over(folder: SweepFolder, runs: Sequence[Planned], say: Callable[[str], None]) -> None:
+    """Name the directories of runs that no table tells of."""
+    if left := folder.left_over(runs):
+        names = ", ".join(shown(name) for name in left[:_TOLD]) + " ..." * (len(left) > _TOLD)
+        say(f"{len(left)} in {folder.path / RUNS} not in the plan, in no table, and left as they are: {names}")
 
 
 def _say_states(
@@ -249,6 +262,7 @@ def _say_states(
     counts = Counter(look.state for look in looks.values())
     ranks = {run.name: run.ranks for run in chosen}
     rest = "" if len(chosen) == len(runs) else f" of {len(runs)}"
+    _say_left_over(folder, runs, say)
     say(f"{len(chosen)}{rest} runs: {_counts(counts)}{_time_left(looks, ranks, cores)}")
     return DONE
 
@@ -259,11 +273,21 @@ def _counts(states: Counter[str]) -> str:
 
 def _time_left(looks: dict[str, Look], ranks: dict[str, int], cores: int) -> str:
     """Return how long what is left may take on so many cores, if it is like what has ended."""
-    known = [float(one.summary["wall_s"]) for one in looks.values() if one.state == "done" and "wall_s" in one.summary]
-    unfinished = [name for name, look in looks.items() if look.state not in (*RESULTS, "lost", "refused")]
+    taken = [_seconds(look) for look in looks.values() if look.state == "done"]
+    known = [seconds for seconds in taken if seconds is not None]
+    unfinished = [name for name, look in looks.items() if look.state not in (*RESULTS, *LEFT_ALONE)]
     left = sum(min(ranks[name], cores) for name in unfinished)  # one of more ranks than cores has all of these
     if not known or not left:
         return ""
     each = sum(known) / len(known)
     spread = f"{min(known):.3g} to {max(known):.3g} s a run"
     return f"; about {each * max(1, left / cores):.3g} s left here ({spread})"
+
+
+def _seconds(look: Look) -> float | None:
+    """Return how long a run has taken: of its processes from their starts to their ends, where all of that is known."""
+    taken = [attempt.seconds for attempt in look.attempts]
+    if taken and None not in taken:
+        return sum(one for one in taken if one is not None)
+    wall = look.summary.get("wall_s")
+    return None if wall is None else float(wall)

@@ -7,18 +7,22 @@ import fcntl
 import io
 import json
 import os
+import re
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import petfsi
 from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.output import files
-from petfsi.output.mesh_files import copy_mesh
-from petfsi.sweeps.plan import INPUTS, Plan, Planned
+from petfsi.output.mesh_files import copy_mesh, mesh_files
+from petfsi.scene.load import load_scene
+from petfsi.sweeps.attempts import NAME as ATTEMPTS
+from petfsi.sweeps.claim import NAME as CLAIM
+from petfsi.sweeps.plan import INPUTS, Plan, Planned, digest_of, mesh_folders
 
 #: Marks a folder as a sweep's.
 MARKER, FORMAT = ".petfsi-sweep", 1
@@ -31,6 +35,9 @@ RUNS, REPLACED = "runs", "replaced"
 _MOST = 16_000_000
 #: Runs, and keys of each, that a message names.
 _TOLD, _KEYS = 8, 6
+_MESH = re.compile(r'"(meshes/[^"]+)"')
+#: At the end of the name of an input, what its content is.
+_DIGEST = re.compile(r"-([0-9a-f]{12})\.(?:toml|opts)$")
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,7 @@ class SweepFolder:
             raise InputError(f"{self.path} was not made whole; once more: petfsi sweep SWEEP.toml --out {self.path}")
         again = f"petfsi sweep SWEEP.toml --out {self.path}"
         try:
-            with open(self.plan, encoding="utf-8", newline="") as file:
+            with open(files.open_plain(self.plan), encoding="utf-8", newline="") as file:
                 hashes = {row["name"]: row["hash"] for row in csv.DictReader(file)}
         except (OSError, ValueError, KeyError, csv.Error):
             raise InputError(f"{self.plan} cannot be read; it is written anew by: {again}") from None
@@ -120,9 +127,10 @@ class SweepFolder:
         """Return what a run's directory says that it is; None if it does not, or its hash is another's."""
         try:
             data = json.loads(files.read_small(self.run(name) / RUN, _MOST))
-            told = data.pop("hash")
+            told, whole = data.pop("hash"), data.pop("whole", None)
             run = Planned.of(data)
-            return run if (run.hash, run.name) == (told, name) else None
+            right = (run.hash, run.name) == (told, name) and whole in (None, run.whole)  # older ones have none
+            return run if right else None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
 
@@ -143,17 +151,70 @@ class SweepFolder:
     def left_over(self, runs: Sequence[Planned]) -> list[str]:
         """Return the names of runs that are here, and are not in the plan any more."""
         known = {run.name for run in runs}
-        there = sorted(path.parent.name for path in (self.path / RUNS).glob(f"*/{RUN}"))
-        return [name for name in there if name not in known]
+        there = [path.name for path in (self.path / RUNS).glob("*") if path.is_dir()]
+        return sorted(name for name in there if name not in known)
+
+    def check_ours(self, runs: Sequence[Planned]) -> None:
+        """Raise InputError, by name, of links where a sweep writes: what they name is elsewhere."""
+        meshes = [f"{INPUTS}/meshes", *(f"{INPUTS}/meshes/{path.name}" for path in self.inputs.glob("meshes/*"))]
+        folders = [INPUTS, *meshes, RUNS, REPLACED, *(f"{RUNS}/{run.name}" for run in runs)]
+        own = [WRITING, *(f"{RUNS}/{run.name}/{name}" for run in runs for name in (RUN, OUTPUT, ATTEMPTS, CLAIM))]
+        for names, is_ours, what in ((folders, stat.S_ISDIR, "folder"), (own, stat.S_ISREG, "plain file")):
+            for name in names:
+                try:
+                    mode = os.lstat(self.path / name).st_mode
+                except (FileNotFoundError, NotADirectoryError):
+                    continue
+                except OSError as error:
+                    raise InputError(f"{self.path / name}: {files.reason(error)}") from error
+                if not is_ours(mode):
+                    kind = "a link" if stat.S_ISLNK(mode) else f"no {what}"
+                    raise InputError(f"{self.path / name} is {kind}; a sweep writes there: put a {what} in its place")
+
+    def check_inputs(self, runs: Sequence[Planned]) -> None:
+        """Raise InputError, by name, of a scene, an options file or a mesh that is not what its name says."""
+        names = [name for run in runs for name in (Path(run.scene).name, *run.options)]
+        for name in dict.fromkeys(names):
+            digest = _DIGEST.search(name)
+            if digest is None:
+                continue
+            try:
+                fits = digest_of(files.read_small(self.inputs / name, _MOST)) == digest[1]
+                why = "" if fits else "has been changed since it was planned; put it back"
+            except OSError as error:
+                why = f"cannot be read: {files.reason(error)}"
+            if why:
+                raise self._unfit(self.inputs / name, why)
+        self._check_meshes(runs)
+
+    def _check_meshes(self, runs: Sequence[Planned]) -> None:
+        """Raise InputError of a mesh that has changed; one that several scenes have is looked at once."""
+        seen: set[str] = set()
+        for run in runs:
+            named = {mesh for value in run.settings().values() for mesh in _MESH.findall(value)}
+            if named <= seen:
+                continue
+            seen |= named
+            for folder, together in mesh_folders(mesh_files(load_scene(self.path / run.scene))):
+                place = together[0].source.parent
+                if place.name != Path(folder).name:
+                    raise self._unfit(place, "holds another mesh than when it was planned; put it back")
+
+    def _unfit(self, path: Path, why: str) -> InputError:
+        return InputError(
+            f"{path} {why}, or remove it, and it is written anew by: petfsi sweep SWEEP.toml --out {self.path}"
+        )
 
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Keep other calls from writing what is the sweep's own while this one does."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            file = open(self.path / WRITING, "wb")  # noqa: SIM115 - closed below
+            file = open(files.open_plain(self.path / WRITING, os.O_RDWR | os.O_CREAT), "wb")  # noqa: SIM115 - closed below
         except OSError as error:
-            raise InputError(f"sweep folder {self.path} cannot be written: {files.reason(error)}") from error
+            place = Path(error.filename or self.path).name
+            where = f": {place}" * (place != self.path.name)
+            raise InputError(f"sweep folder {self.path} cannot be written{where}: {files.reason(error)}") from error
         with file:
             with suppress(OSError):  # where the file system knows no locks there is one call at a time, it is hoped
                 fcntl.flock(file, fcntl.LOCK_EX)
@@ -190,13 +251,13 @@ class SweepFolder:
     def prepare(self, run: Planned) -> None:
         """Write a run's directory, empty but for what it is."""
         self.run(run.name).mkdir(parents=True, exist_ok=True)
-        about = {**asdict(run), "hash": run.hash}
+        about = {**asdict(run), "hash": run.hash, "whole": run.whole}
         _replace(self.run(run.name) / RUN, (json.dumps(about, indent=1) + "\n").encode())
 
     def set_aside(self, run: Planned) -> Path:
         """Move a run's directory to where replaced ones are, and make a new one; return where it is now."""
         numbers = (self.path / REPLACED / f"{run.name}.{n}" for n in range(1, 1 << 20))
-        aside = next(path for path in numbers if not path.exists())
+        aside = next(path for path in numbers if not os.path.lexists(path))
         aside.parent.mkdir(exist_ok=True)
         os.rename(self.run(run.name), aside)
         self.prepare(run)
@@ -237,18 +298,10 @@ def _replace(path: Path, data: bytes) -> None:
     """Give a file its content in one piece; of thousands none is waited for until it is on the disk."""
     part = files.part_of(path)
     try:
-        part.write_bytes(data)
+        with open(files.new_file(part), "wb") as file:
+            file.write(data)
         os.replace(part, path)
     except OSError:
         with suppress(OSError):
             part.unlink()
         raise
-
-
-def known(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file that a run wrote, or nothing of one that cannot be read."""
-    try:
-        data = json.loads(files.read_small(path, _MOST))
-        return data if isinstance(data, dict) else {}
-    except (OSError, ValueError, RecursionError):
-        return {}

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from petfsi.output import files
 from petfsi.output.files import RUN_MARKER
 from petfsi.sweeps.folder import OUTPUT, SweepFolder
 from petfsi.sweeps.plan import Planned
@@ -64,7 +65,8 @@ def environment(given: Mapping[str, str]) -> dict[str, str]:
 def start(folder: SweepFolder, run: Planned, words: Sequence[str], claim: int) -> subprocess.Popen[bytes]:
     """Start the process of a run with ``run_words``, in a session of its own: Ctrl-C reaches the sweep alone."""
     line = [*launcher(run.ranks), *petfsi_words(), *words]
-    with open(folder.run(run.name) / OUTPUT, "ab") as output:
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT
+    with open(files.open_plain(folder.run(run.name) / OUTPUT, flags), "ab") as output:
         return subprocess.Popen(
             line,
             stdin=subprocess.DEVNULL,

@@ -14,7 +14,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ INPUTS = "inputs"
 #: Digits of digests in names of files.
 _DIGITS = 12
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_OPTION = re.compile(r"(^|: )-")
 _SCENE = re.compile(rf"{INPUTS}/scene-[0-9a-f]{{{_DIGITS}}}\.toml")
 #: Runs that are the same as others, of those that are told.
 _TOLD = 8
@@ -82,7 +83,7 @@ class Planned:
         texts = [*run.axes, *run.axes.values(), *run.says, *run.says.values(), *run.options, run.name, run.scene]
         counts = [run.ranks, run.repeat, 1 if run.steps is None else run.steps]
         words = {word.lower() for word in run.options}
-        files = [after for word, after in pairwise(run.options) if word == f"-{options.FILE}"]
+        files = [after for word, after in pairwise(run.options) if word.lower() == f"-{options.FILE}"]
         if (
             not all(isinstance(text, str) for text in texts)
             or not all(type(count) is int and count > 0 for count in counts)
@@ -93,6 +94,16 @@ class Planned:
         ):
             raise ValueError("no run of a sweep")
         return run
+
+    @property
+    def whole(self) -> str:
+        """What tells whether any of it is another: also axes, scene and options, which ``says`` does not hold."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+    def settings(self) -> dict[str, str]:
+        """Return the settings of its scene, of all that it says."""
+        others = ("ranks", "repeat", "steps")
+        return {key: value for key, value in self.says.items() if key not in others and not _OPTION.search(key)}
 
     @property
     def hash(self) -> str:
@@ -156,7 +167,8 @@ class _Planner:
         self._directory = file.path.parent
         self._scenes: dict[str, tuple[str, dict[str, str]] | None] = {}
         self._options: dict[str, tuple[list[str], dict[str, str]] | None] = {}
-        self._names: dict[tuple[str | int, ...], str] = {}
+        self._meant: dict[str, _Meant] = {}  # by an own file of options
+        self._names: dict[tuple[str, tuple[_Meant, str], int, int], str] = {}
         self._twins: list[str] = []
 
     def build(self, scene: Path) -> None:
@@ -190,7 +202,7 @@ class _Planner:
         ranks = next((point.ranks for point in points.values() if point.ranks), 1)
         steps = self.file.steps
         says = {**scene[1], **chosen[1], "ranks": str(ranks), "repeat": str(repeat), "steps": str(steps or "all")}
-        first = self._names.setdefault((scene[0], *chosen[0], ranks, repeat), name)
+        first = self._names.setdefault((scene[0], self._sense(chosen[0]), ranks, repeat), name)
         if first != name:
             self._twins.append(
                 f"run {name}: is the same as {first}: nothing differs, or one axis undoes what another sets"
@@ -218,19 +230,14 @@ class _Planner:
         scene = scene_from_dict(data, self._directory)
         names = self._copied(mesh_files(scene))
         text = dump_scene(scene, names)
-        name = f"scene-{hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]}.toml"
+        name = scene_name(text.encode())
         self.plan.files[name] = text.encode()
-        return f"{INPUTS}/{name}", {".".join(key): as_toml(value) for key, value in _leaves(tomllib.loads(text))}
+        return f"{INPUTS}/{name}", settings_of(text)
 
     def _copied(self, meshes: list[MeshFile]) -> dict[str, str]:
         """Return new names of mesh files by their paths; files that belong together stay in a folder of their own."""
-        folders: dict[str, list[MeshFile]] = {}
-        for mesh in meshes:
-            folders.setdefault(os.path.dirname(mesh.mark.file), []).append(mesh)
         names = {}
-        for together in folders.values():
-            digests = json.dumps([mesh.mark.blake2b for mesh in together])
-            folder = f"meshes/{hashlib.sha256(digests.encode()).hexdigest()[:_DIGITS]}"
+        for folder, together in mesh_folders(meshes):
             for mesh in together:
                 names[os.path.abspath(mesh.source)] = f"{folder}/{mesh.source.name}"
                 self.plan.meshes[f"{folder}/{mesh.source.name}"] = mesh
@@ -265,6 +272,14 @@ class _Planner:
         says |= {f"{name}: -{option.name}": option.value for option in read}
         return [f"-{options.FILE}", self._own_file(file, read), *over], says
 
+    def _sense(self, words: list[str]) -> tuple[_Meant, str]:
+        """Return what words of options mean, whatever their order, and how their numbers and their file are spelt."""
+        file = words[1] if words[:1] == [f"-{options.FILE}"] else ""
+        over = _meant(options.from_words(words[2:] if file else words))
+        own = self._meant.get(file, frozenset())
+        given = {name for name, _ in over}
+        return over | {(name, value) for name, value in own if name not in given}, "" if own else file
+
     def _options_path(self, file: str) -> Path:
         """Return where an options file is: beside the sweep's file, or, as a bare name that is not there, shipped."""
         beside = self.file.path.parent / file
@@ -281,8 +296,9 @@ class _Planner:
                 lines.append(line)
         text = "\n".join(lines) + "\n"
         stem = Path(file).stem
-        name = f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]}.opts"
+        name = f"{stem}-{digest_of(text.encode())}.opts"
         self.plan.files[name] = text.encode()
+        self._meant[name] = _meant(read)
         return name
 
     def _tell(self, text: str, points: Mapping[str, Point], name: str) -> None:
@@ -293,6 +309,46 @@ class _Planner:
             line = line.strip()
             if not any(line in told for told in self.mistakes):
                 self.mistakes.append(f"run {name}: {line}" if points else line)
+
+
+def scene_name(text: bytes) -> str:
+    """Return the name of a scene's file among the inputs: another text has another."""
+    return f"scene-{digest_of(text)}.toml"
+
+
+def digest_of(data: bytes) -> str:
+    """Return what stands for some bytes in the name of a file."""
+    return hashlib.sha256(data).hexdigest()[:_DIGITS]
+
+
+def mesh_folders(meshes: list[MeshFile]) -> Iterator[tuple[str, list[MeshFile]]]:
+    """Yield the folders among the inputs, each with the mesh files that belong together: others have another name."""
+    folders: dict[str, list[MeshFile]] = {}
+    for mesh in meshes:
+        folders.setdefault(os.path.dirname(mesh.mark.file), []).append(mesh)
+    for together in folders.values():
+        digests = json.dumps([mesh.mark.blake2b for mesh in together])
+        yield f"meshes/{digest_of(digests.encode())}", together
+
+
+def settings_of(scene: str) -> dict[str, str]:
+    """Return by key the settings of a scene's text, as TOML; ValueError if it is none."""
+    return {".".join(key): as_toml(value) for key, value in _leaves(tomllib.loads(scene))}
+
+
+#: Options by name, the value a number where it is one.
+_Meant = frozenset[tuple[str, str | float]]
+
+
+def _meant(given: list[options.Option]) -> _Meant:
+    return frozenset({option.name: _number(option.value) for option in given}.items())
+
+
+def _number(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _check_options(words: list[str]) -> None:

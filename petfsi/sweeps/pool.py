@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -12,18 +13,22 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
 
+from petfsi.errors import InputError
+from petfsi.output import files
 from petfsi.runs.failure import NO_ROOM
 from petfsi.sweeps import attempts
 from petfsi.sweeps.claim import at_work, claim, give_back, is_busy, is_elsewhere
 from petfsi.sweeps.folder import SweepFolder
 from petfsi.sweeps.launch import run_words, start
 from petfsi.sweeps.plan import Planned
-from petfsi.sweeps.states import RESULTS, Look, look_at, said_so_far
+from petfsi.sweeps.states import LEFT_ALONE, RESULTS, Look, look_at, said_so_far
 
 #: Bytes that must be free on the disk for a run to start.
 LEAST_ROOM = 100_000_000
 #: Seconds between two looks at processes of one's own, and at runs at which others are.
 POLL, LOOK = 0.01, 0.5
+#: What the system says of a link, or of what is no plain file, in the place of one.
+_NOT_OURS = (errno.ELOOP, errno.EINVAL, errno.EISDIR, errno.ENXIO)
 #: Seconds that ranks have to end once mpirun is told to end them.
 PATIENCE = 5.0
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -156,7 +161,7 @@ class Pool:
             self.ended += 1
             return None
         look = look_at(path, run, busy=False)
-        if look.state in (*RESULTS, "lost", "refused"):
+        if look.state in (*RESULTS, *LEFT_ALONE):
             self.ended += 1
             return None
         if shutil.disk_usage(path).free < LEAST_ROOM:
@@ -261,6 +266,8 @@ class Pool:
         try:
             yield
         except OSError as error:
+            if error.errno in _NOT_OURS and error.filename:
+                raise InputError(f"{error.filename} cannot be written: {files.reason(error)}") from error
             if error.errno not in NO_ROOM:
                 raise
             self._stop(self._no_room())

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from petfsi.errors import InputError
+from petfsi.messages import shown
+from petfsi.output import files
+from petfsi.output.summary import read_summary
 from petfsi.runs.failure import NO_RESULT
 from petfsi.sweeps.attempts import Attempt, read_attempts
 from petfsi.sweeps.claim import at_work, is_busy
-from petfsi.sweeps.folder import OUTPUT, known
+from petfsi.sweeps.folder import OUTPUT
 from petfsi.sweeps.plan import Planned
+from petfsi.sweeps.settings import differences
 
 #: In the order of their telling. A failed run is a result: the same scene and options will fail again.
-STATES = ("done", "failed", "running", "new", "stopped", "broken", "lost", "refused")
+STATES = ("done", "failed", "running", "new", "stopped", "broken", "lost", "refused", "changed")
 RESULTS = ("done", "failed")
+#: Of these none is run again before that is asked for.
+LEFT_ALONE = ("lost", "refused", "changed")
 #: So many attempts without a step gained are enough.
 MOST_ATTEMPTS = 3
 REFUSED, FAILED, STOPPED = 2, 3, 75
@@ -24,6 +33,8 @@ REFUSED, FAILED, STOPPED = 2, 3, 75
 _UNHEARD = (-signal.SIGUSR1, 128 + signal.SIGUSR1)
 #: Bytes at the end of the output in which its last message is looked for.
 _WORDS = 4000
+#: What a number in a summary is below.
+_LARGEST = 1e300
 
 
 @dataclass
@@ -64,18 +75,53 @@ def look_at(path: Path, run: Planned, busy: bool | None = None) -> Look:
     busy : bool, optional
         Whether it is at work, where that is known: whoever claims a run knows.
     """
-    attempts, summary, step = read_attempts(path), known(path / "summary.json"), newest_step(path)
+    attempts, step = read_attempts(path), newest_step(path)
+    summary, damage = _summary(path)
     failure = summary.get("failure")
     kind = str(failure.get("kind", "")) if isinstance(failure, dict) else ""
     found = Look("new", "", step, kind, summary, attempts)
     if is_busy(path) if busy is None else busy:
         found.state, found.reason = "running", at_work(path)
         return found
-    found.state, found.reason = _ended(path, run, summary, kind, attempts)
+    if told := differences(path, run, summary):  # its figures are not those of the plan
+        return Look("changed", told, step, attempts=attempts)
+    found.state, found.reason = _ended(path, run, summary, kind, attempts, damage)
     if found.state == "broken" and is_lost(attempts, step):
         found.state = "lost"
         found.reason = f"{MOST_ATTEMPTS} attempts gained no step: {found.reason}"
     return found
+
+
+def _summary(path: Path) -> tuple[dict[str, Any], str]:
+    """Return what a summary says, and in words why it cannot be believed."""
+    try:
+        summary = read_summary(path / "summary.json")
+    except InputError as error:
+        there = os.path.lexists(path / "summary.json")
+        return {}, str(error).removeprefix(f"{path}/") if there else ""
+    wrong = next(_misfits(summary), "")
+    return ({}, f"summary.json is damaged: {wrong}") if wrong else (summary, "")
+
+
+def _misfits(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield what of a summary has another form than petfsi gives it."""
+    for key in ("steps", "time", "wall_s", "ranks"):
+        if not _is_number(summary.get(key, 0), int if key in ("steps", "ranks") else (int, float)):
+            yield f"{key} is {shown(summary[key])}"
+    for key in ("unknowns", "iterations", "phases", "probes", "versions", "failure"):
+        table = summary.get(key)
+        if table is not None and not isinstance(table, dict):
+            yield f"{key} is {shown(table)}"
+        for name, value in table.items() if isinstance(table, dict) else ():
+            if key in ("unknowns", "iterations", "phases") and not _is_number(value, (int, float)):
+                yield f"{key}.{shown(name)} is {shown(value)}"
+
+
+def _is_number(value: Any, kinds: type | tuple[type, ...]) -> bool:
+    """Return whether a value is a number, or None, as a number that is not finite is written down."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value is None
+    return isinstance(value, kinds) and abs(value) < _LARGEST
 
 
 def newest_step(path: Path) -> int:
@@ -90,8 +136,12 @@ def is_lost(attempts: list[Attempt], step: int) -> bool:
     return len(last) == MOST_ATTEMPTS and all(attempt.step >= step for attempt in last)
 
 
-def _ended(path: Path, run: Planned, summary: dict[str, Any], kind: str, attempts: list[Attempt]) -> tuple[str, str]:
+def _ended(
+    path: Path, run: Planned, summary: dict[str, Any], kind: str, attempts: list[Attempt], damage: str
+) -> tuple[str, str]:
     """Return state and reason of a run at which nobody is at work."""
+    if damage:  # whatever its exit code is, what came out was not written down
+        return "broken", damage
     status, reason = summary.get("status"), str(summary.get("reason", ""))
     steps, last = summary.get("steps"), attempts[-1].exit if attempts else None
     enough = run.steps is not None and isinstance(steps, int) and steps >= run.steps
@@ -135,7 +185,7 @@ def said_so_far(path: Path) -> int:
 def last_words(path: Path, attempts: list[Attempt]) -> str:
     """Return what the last attempt said last: its last message, without what mpirun has to say of it in its frames."""
     try:
-        with open(path / OUTPUT, "rb") as file:
+        with open(files.open_plain(path / OUTPUT), "rb") as file:
             file.seek(max(attempts[-1].output if attempts else 0, file.seek(0, 2) - _WORDS))
             lines = [line.strip() for line in file.read().decode(errors="replace").strip().splitlines()]
     except OSError:

@@ -22,7 +22,8 @@ def collect(folder: SweepFolder, runs: Sequence[Planned]) -> list[dict[str, Any]
     """Write ``runs.csv``, and return its rows."""
     rows = [row_of(run, look_at(folder.run(run.name), run)) for run in runs]
     with folder.alone():
-        files.replace_text(folder.table, table_text(rows))
+        # what a summary says may be no text
+        files.replace_text(folder.table, table_text(rows).encode("utf-8", "backslashreplace"))
     return rows
 
 
