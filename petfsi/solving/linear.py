@@ -179,10 +179,10 @@ class LinearSolver:
                 self._inner.number = iterations
                 norms = system.update_residual(x, b)
             lost = system.round_off_at(x)
+        require_convergence(self.method, [ksp, *_inner_solvers(ksp)], norms, slack, floor, lost)
         if self._pressure is not None and self._pressure.eliminates and not fixed:
             more, norms = self._close_cells(b, x, CONTINUITY * rtol, norms)
             iterations += more
-        require_convergence(self.method, [ksp, *_inner_solvers(ksp)], norms, slack, floor, lost)
         return iterations, norms
 
     def _close_cells(
