@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from petfsi.errors import InputError
 from petfsi.fields.sph.domain import Domain
 from petfsi.fields.sph.dummies import NEAR
 from petfsi.fields.sph.law import Law
@@ -34,6 +35,8 @@ BLOCKED = 0.75
 TOLD = 6
 #: What has so many times the fluid's places is laid out in the fluid's box alone; what is beyond is not counted.
 FAR = 1e3
+#: What is longer than so many periods is refused: it would be as many images.
+PERIODS = 100
 
 
 @dataclass(frozen=True)
@@ -223,6 +226,11 @@ class _Lattice:
         for a in range(dim):
             low, high, h = domain.low[a], domain.high[a], self.width[a]
             begin, end = (low, high) if reach is None else (reach[0][a], reach[1][a])
+            if domain.periodic[a] and shape.box is None and end - begin > PERIODS * (high - low):
+                raise InputError(
+                    f"{key}: is {end - begin:g} m long along {'xyz'[a]}, which repeats after {high - low:g} m; at most "
+                    f"{PERIODS} times that is filled"
+                )
             if domain.periodic[a] and (shape.box is None or end - begin >= high - low):
                 begin, end = low, high
             elif self.far and not domain.periodic[a]:
