@@ -35,7 +35,7 @@ def _jet(key: str, jet: GridInflow, side: str, fluid: MacFluid, dim: int) -> Pro
     if jet.along is not None and axis < len(jet.along) == dim and jet.along[axis] != 0:
         allowed = f"must be 0: what comes in across the side, along {'xyz'[axis]}, is its speed"
         yield Problem(f"{key}.along.{axis}", jet.along[axis], allowed)
-    if jet.region is None or axis >= dim or not is_measured(fluid, dim):
+    if jet.region is None or len(jet.region.kinds) != 1 or axis >= dim or not is_measured(fluid, dim):
         return
     low, high = np.array(fluid.origin, dtype=float), np.array(fluid.origin) + fluid.size
     at = high[axis] if side == OPPOSITE[axis][1] else low[axis]

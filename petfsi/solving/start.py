@@ -74,7 +74,20 @@ def fit_velocities(
         outflow = _outflow(system, fluid, LEFT)
     if outflow is not None:
         _change(system, solver, regions, fluid, solid, dt, None, outflow)
+    _show(system, fluid)
     return reasons
+
+
+def _show(system: System, fluid: PressureFluid | None) -> None:
+    """Leave what flows out of cells in the residual, as steps do. Collective."""
+    system.residual.set(0.0)
+    if fluid is not None:
+        system.residual.array[system.piece(fluid.name)] = fluid.row_scale * np.sum(_outflows(system, fluid), axis=0)
+
+
+def _outflows(system: System, fluid: PressureFluid) -> list[np.ndarray]:
+    """Return what the fluid's faces and each coupling's let out of cells, by unknown, m^3/s (m^2/s in 2D)."""
+    return [fluid.net_outflow(), *(coupling.outflow() for coupling in system.couplings)]
 
 
 def _outflow(system: System, fluid: PressureFluid | None, little: float = 0.0) -> np.ndarray | None:
@@ -84,7 +97,7 @@ def _outflow(system: System, fluid: PressureFluid | None, little: float = 0.0) -
     """
     if fluid is None:
         return None
-    parts = [fluid.net_outflow(), *(coupling.outflow() for coupling in system.couplings)]
+    parts = _outflows(system, fluid)
     outflow = np.sum(parts, axis=0)
     squares = system.comm.allreduce(np.array([outflow @ outflow, *(part @ part for part in parts)]))
     left, terms = np.sqrt(squares[0]), np.sqrt(squares[1:].sum())
