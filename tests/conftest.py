@@ -39,11 +39,11 @@ def pytest_itemcollected(item):
 def pytest_collection_modifyitems(config, items):
     """Keep the tests for this number of ranks: ``mpiexec -n 3 pytest`` runs those marked ``parallel(3)``.
 
-    Of ``PETFSI_HALF``, 0 or 1, every second module: a process that runs all of them holds twice as much in the end.
+    Of ``PETFSI_THIRD``, 0 to 2, every third module: a process that runs all of them holds as much more in the end.
     """
     match = [item for item in items if item.get_closest_marker("parallel[match]")]
-    if half := os.environ.get("PETFSI_HALF"):
-        modules = sorted({item.path for item in items})[int(half) :: 2]
+    if third := os.environ.get("PETFSI_THIRD"):
+        modules = sorted({item.path for item in items})[int(third) :: 3]
         match = [item for item in match if item.path in modules]
     if not os.environ.get("PETFSI_SLOW"):
         match = [item for item in match if not item.get_closest_marker("slow")]

@@ -16,8 +16,8 @@ export OMPI_MCA_mpi_yield_when_idle=1
 unset PYTHONDONTWRITEBYTECODE
 bash tests/compile.sh
 # a process per core; who has nothing left takes tests from the others (5: of those asked for none is there)
-for half in 0 1; do # what was compiled and imported stays: new processes for the second half take less memory
-    PETFSI_HALF=$half .venv/bin/python -m pytest -q -n auto --dist worksteal --durations=6 -m "not launches" "$@" ||
+for third in 0 1 2; do # what was compiled and imported stays: new processes for each third take less memory
+    PETFSI_THIRD=$third .venv/bin/python -m pytest -q -n auto --dist worksteal --durations=6 -m "not launches" "$@" ||
         [ $? = 5 ]
 done
 echo "== processes of several ranks"
