@@ -190,7 +190,22 @@ def test_overwrite_takes_the_old_run_away_only_for_one_that_passes(tmp_path, her
     assert here("run", scene, "--out", "run", "--overwrite", "--steps", 1).returncode == 0
 
 
-def test_a_take_over_that_was_killed_is_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize("times", [1, 3])
+def test_a_take_over_that_was_killed_is_no_obstacle(tmp_path, times):
+    """Its file names a process that is gone: of several that come to this one removes it, and one gets the lock."""
+    left(tmp_path)
+    (tmp_path / lock.TAKING).write_bytes((tmp_path / lock.NAME).read_bytes())
+    held = []
+    for _ in range(times):
+        try:
+            held.append(acquire(tmp_path))
+        except InputError as error:
+            assert "another process is at work in it" in str(error)
+    assert len(held) == 1 and not (tmp_path / lock.TAKING).exists()
+    held[0].release()
+
+
+def test_a_take_over_whose_process_is_not_known_to_be_gone_is_named(tmp_path, monkeypatch):
     left(tmp_path)
     (tmp_path / lock.TAKING).write_text("")
     monkeypatch.setattr(lock, "_TRIES", 2)

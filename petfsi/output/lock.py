@@ -238,6 +238,7 @@ def _take_over(path: Path) -> Lock | None:
         # of several that come to this, one at a time looks again and takes it
         guard = _make_plainly(taking)
         if guard is None:
+            _clear(taking)
             return None
         try:
             if not _same(path, old):
@@ -247,6 +248,20 @@ def _take_over(path: Path) -> Lock | None:
             return Lock(path, handle)
         finally:
             guard.release()
+    finally:
+        os.close(old)
+
+
+def _clear(taking: Path) -> None:
+    """Remove what a process left that was ended while it took a lock over, where ``flock`` lets one alone do so."""
+    old = _open_old(taking)
+    if old is None:
+        return
+    try:
+        free = _flock(old)
+        holder = Holder.read(os.pread(old, MAX_BYTES, 0))
+        if free and holder is not None and holder.here and holder.gone() and _same(taking, old):
+            taking.unlink()
     finally:
         os.close(old)
 

@@ -53,13 +53,12 @@ def at_point(fluid: Fluid, quantity: str, point: np.ndarray) -> float | np.ndarr
 
 
 def front(fluid: Fluid) -> float:
-    """Return the largest x of the liquid, half a spacing beyond its last particle, m; -inf of none. Collective."""
-    found = float(fluid.swarm["x"][_joined(fluid), 0].max(initial=-np.inf))
-    return fluid.comm.allreduce(found, MPI.MAX) + fluid.spacing / 2
+    """Return the largest x of the liquid, half a spacing beyond its last particle, m; nan of none. Collective."""
+    return _last(fluid, fluid.swarm["x"][_joined(fluid), 0]) + fluid.spacing / 2
 
 
 def level(fluid: Fluid, point: np.ndarray) -> float:
-    """Return how high the liquid stands over (or under) a point, against gravity, m; -inf where none does. Collective.
+    """Return how high the liquid stands over (or under) a point, against gravity, m; nan where none does. Collective.
 
     Half a spacing above the highest particle within a spacing of the line through the point.
     """
@@ -68,8 +67,13 @@ def level(fluid: Fluid, point: np.ndarray) -> float:
     sense = 1.0 if g[up] <= 0 else -1.0
     way = np.delete(x - point, up, axis=1)
     near = _joined(fluid) & (np.linalg.norm(way, axis=1) <= fluid.spacing)
-    found = float((sense * x[near, up]).max(initial=-np.inf))
-    return sense * (fluid.comm.allreduce(found, MPI.MAX) + fluid.spacing / 2)
+    return sense * (_last(fluid, sense * x[near, up]) + fluid.spacing / 2)
+
+
+def _last(fluid: Fluid, places: np.ndarray) -> float:
+    """Return the largest of all ranks' places, nan of none. Collective."""
+    found = fluid.comm.allreduce(float(places.max(initial=-np.inf)), MPI.MAX)
+    return found if np.isfinite(found) else np.nan
 
 
 def _joined(fluid: Fluid) -> np.ndarray:
