@@ -4,7 +4,8 @@ import meshio
 import pytest
 
 from petfsi.geometry.readers.abaqus import read_abaqus
-from petfsi.geometry.readers.abaqus_cards import DEPTH, read_cards
+from petfsi.geometry.readers.abaqus_cards import read_cards
+from petfsi.geometry.readers.included import DEPTH
 from petfsi.output.mesh_files import _with_companions
 
 NODES = ["1, 0., 0.", "2, 1., 0.", "3, 2., 0.", "4, 0., 1.", "5, 1., 1.", "6, 2., 1."]

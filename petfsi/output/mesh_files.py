@@ -132,13 +132,14 @@ def _included(path: Path) -> set[Path]:
     """Return the files that one of Abaqus's or Nastran's includes, and those that these do."""
     from petfsi.geometry.readers import abaqus_cards, nastran_cards
     from petfsi.geometry.readers.formats import find_readers
+    from petfsi.geometry.readers.included import read_text
 
     known = {"abaqus": abaqus_cards, "nastran": nastran_cards}
     cards = next((known[name] for name, _ in find_readers(path) if name in known), None)
     found: set[Path] = set()
     rest = [path] if cards else []
     while cards and rest:
-        names = cards.included_names(cards.read_text(rest.pop()))
+        names = cards.included_names(read_text(rest.pop()))
         new = {path.parent / name for name in names if Path(name).name == name} - found
         found |= new
         rest += [other for other in new if other.is_file()]

@@ -11,10 +11,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import meshio
-
-#: How deep files include others.
-DEPTH = 5
+from petfsi.geometry.readers.included import read_text, spliced
 
 #: With the lines that go on with it, where it ends in a comma. It begins with its star, not with its line, to be found
 #: fast in large files.
@@ -33,12 +30,12 @@ def read_cards(path: Path) -> Iterator[Card]:
     Raises
     ------
     meshio.ReadError
-        When a file includes itself, or files that are not beside it, or more than ``DEPTH`` deep.
+        When a file includes itself, or files that are not beside it, or too deep.
     OSError
         When a file cannot be read.
     """
     card: Card | None = None
-    for text in _pieces(path, ()):
+    for text in spliced(path, read_text(path), _includes, "*INCLUDE"):
         lines = _lines(text)
         starts = [n for n, line in enumerate(lines) if line.lstrip()[:1] == "*"]
         if card is not None:  # what stands before the first card goes on with the card before the piece
@@ -58,35 +55,6 @@ def read_cards(path: Path) -> Iterator[Card]:
 def included_names(text: str) -> list[str]:
     """Return the names of the files that a text includes, as they are beside it: without ``./``."""
     return [name for _, _, name in _includes(text)]
-
-
-def read_text(path: Path) -> str:
-    """Return a file's text, whatever its bytes are; lines end in one character, and no mark comes before them.
-
-    Raises
-    ------
-    OSError
-        When it cannot be read.
-    """
-    return path.read_text(encoding="utf-8-sig", errors="replace")
-
-
-def _pieces(path: Path, above: tuple[str, ...]) -> Iterator[str]:
-    """Yield the text of a file, cut where it includes others, with theirs in their places."""
-    text, begin = read_text(path), 0
-    above = (*above, path.name)
-    for start, end, name in _includes(text):
-        yield text[begin:start]
-        begin = end
-        beside = path.with_name(name) if Path(name).name == name != ".." else None
-        if beside is None or (beside.exists() and not beside.is_file()):
-            raise meshio.ReadError(f"*INCLUDE of {name}: it must be a file, beside the file that includes it")
-        if name in above:
-            raise meshio.ReadError(f"*INCLUDE of {name}: it includes itself")
-        if len(above) > DEPTH:
-            raise meshio.ReadError(f"*INCLUDE of {name}: files may include others at most {DEPTH} files deep")
-        yield from _pieces(beside, above)
-    yield text[begin:]
 
 
 def _includes(text: str) -> Iterator[tuple[int, int, str]]:

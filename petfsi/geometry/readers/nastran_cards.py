@@ -13,8 +13,7 @@ from pathlib import Path
 
 import meshio
 
-#: How deep files include others.
-DEPTH = 5
+from petfsi.geometry.readers.included import read_text, spliced
 
 _BULK = re.compile(r"^[^\S\n]*BEGIN\b[^\n]*$", re.IGNORECASE | re.MULTILINE)
 #: With the lines that a long name goes on in.
@@ -29,7 +28,7 @@ def read_cards(path: Path) -> Iterator[Card]:
     Raises
     ------
     meshio.ReadError
-        When a file includes itself, or files that are not beside it, or more than ``DEPTH`` deep; when a card cannot be
+        When a file includes itself, or files that are not beside it, or too deep; when a card cannot be
         told from the next.
     OSError
         When a file cannot be read.
@@ -53,24 +52,16 @@ def read_cards(path: Path) -> Iterator[Card]:
         yield name, fields
 
 
-def read_text(path: Path) -> str:
-    """Return a file's text, whatever its bytes are; lines end in one character, and no mark comes before them.
-
-    Raises
-    ------
-    OSError
-        When it cannot be read.
-    """
-    return path.read_text(encoding="utf-8-sig", errors="replace")
-
-
 def included_names(text: str) -> list[str]:
     """Return the names of the files that a text includes, as they are beside it: without ``./``."""
-    return [_name(found) for found in _INCLUDE.finditer(text)]
+    return [name for _, _, name in _includes(text)]
 
 
-def _name(found: re.Match[str]) -> str:
-    return str(Path("".join((found[1] or found[2] or found[3] or "").split("\n")).strip()))
+def _includes(text: str) -> Iterator[tuple[int, int, str]]:
+    """Yield where INCLUDE begins and ends, and the names of files."""
+    for found in _INCLUDE.finditer(text):
+        name = "".join((found[1] or found[2] or found[3] or "").split("\n")).strip()
+        yield found.start(), found.end(), str(Path(name))
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -79,30 +70,14 @@ def _lines(path: Path) -> Iterator[str]:
     begins = list(_BULK.finditer(text))
     if len(begins) > 1:
         raise meshio.ReadError("parts with nodes of their own (BEGIN SUPER): write out the assembled model")
-    for piece in _pieces(path, text[begins[0].end() :] if begins else text, ()):
+    bulk = text[begins[0].end() :] if begins else text
+    for piece in spliced(path, bulk, _includes, "INCLUDE"):
         for line in piece.split("\n"):
             line = line.partition("$")[0].rstrip()
             if line[:8].strip().upper() == "ENDDATA":
                 return
             if line:
                 yield line
-
-
-def _pieces(path: Path, text: str, above: tuple[str, ...]) -> Iterator[str]:
-    """Yield a text, cut where it includes files, with theirs in their places."""
-    begin, above = 0, (*above, path.name)
-    for found in _INCLUDE.finditer(text):
-        yield text[begin : found.start()]
-        begin, name = found.end(), _name(found)
-        beside = path.with_name(name) if Path(name).name == name != ".." else None
-        if beside is None or (beside.exists() and not beside.is_file()):
-            raise meshio.ReadError(f"INCLUDE of {name}: it must be a file, beside the file that includes it")
-        if name in above:
-            raise meshio.ReadError(f"INCLUDE of {name}: it includes itself")
-        if len(above) > DEPTH:
-            raise meshio.ReadError(f"INCLUDE of {name}: files may include others at most {DEPTH} files deep")
-        yield from _pieces(beside, read_text(beside), above)
-    yield text[begin:]
 
 
 def _fields(line: str) -> tuple[str, list[str], str]:
