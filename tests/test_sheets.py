@@ -1,5 +1,6 @@
 """Sheets thinner than a cell: what is on one side of them is not felt on the other."""
 
+import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -37,3 +38,26 @@ def test_divided_faces_cross_cells_along_their_axis():
         # 0.48 cells along x; along y it would be 9.6, of which a sweep goes three
         fastest = sim.fluid.sheets.fastest(sim.fluid.velocity)
         assert find_path(sim.fluid.grid, sim.fluid.velocity, fastest, 0.4, "cubic").sweeps == 1
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("angle", [0.3, 0.7, 1.2])
+def test_what_is_at_rest_is_carried_at_rest_from_the_first_step(angle, tmp_path_factory):
+    comm = MPI.COMM_WORLD
+    path = comm.bcast(str(tmp_path_factory.mktemp("mesh") / "sheets.vtk") if comm.rank == 0 else None)
+    if comm.rank == 0:
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        boxes = [((-0.3, 0.3), (-0.4, -0.1)), ((-0.1, -0.096), (-0.2, 0.35)), ((-0.3, 0.35), (0.113, 0.117))]
+        corners = np.array([(x, y) for across, up in boxes for x in across for y in up])
+        lines = np.array([(n, n + 2, n + 2, n + 3, n + 3, n + 1, n + 1, n) for n in (0, 4, 8)]).reshape(-1, 2)
+        meshio.Mesh(np.pad(corners @ turn.T, ((0, 0), (0, 1))), [("line", lines)]).write(path)
+    comm.barrier()
+    fluid = {"density": 1.0, "origin": [-0.5, -0.5], "size": [1.0, 1.0], "cells": [16, 16]}
+    scene = {"dim": 2, "time": {"end": 1.0, "dt": 0.1}, "gravity": [0.0, -1.0], "fluid": fluid}
+    scene["obstacles"] = {"sheets": {"shape": {"mesh": path}}}
+    with simulation(comm, Scene.model_validate(scene), MONOLITHIC) as sim:
+        for read in sim.fluid._transport.read():
+            assert len(read.parts) in (0, len(sim.fluid.sheets.table)), "links without values are read beyond the end"
+            assert not any(np.any(v) for v in (*read, read.parts))
+        assert len(sim.fluid.sheets.table) == len(sim.fluid.velocity.parts) > 0
+        assert any(slim.any() for slim in sim.fluid.sheets.slim) or comm.size > 1

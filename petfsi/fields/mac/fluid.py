@@ -115,11 +115,12 @@ class MacFluid(CoveredGrid):
             set_initial(self.grid, fluid.smoke.initial, "fluid.smoke.initial", self.smoke, None)
             self.smoke[self.cell_kind != kinds.FLUID] = 0.0
             self._extension.cells(self.smoke)
-        self._transport.carried = self._extend(self.velocity)
+        self._transport.carried = self._extend(self.velocity, divided=False)
         self.velocity_star = each(np.copy, self.velocity)
         if self.sheets is not None:
             whole = self._sheets_of(Parts.none())
             self._go_on(Lineage(self.grid, whole, self.sheets, self.face_kind))
+            self._transport.carried = self._extend(self.velocity)
 
     # ---- the step ---------------------------------------------------------------------------------------------
 
@@ -346,16 +347,17 @@ class MacFluid(CoveredGrid):
             second = self.extras.piece == 1
             self._other_pressure.reshape(-1)[self.extras.cell[second]] = self._extra_pressure[second]
 
-    def _extend(self, faces: Faces) -> Faces:
+    def _extend(self, faces: Faces, divided: bool = True) -> Faces:
         """Fill ghosts, bands and what lies beyond the sides; return copies that narrow faces are not read from.
 
-        Without any such faces the arrays themselves are returned. Collective.
+        Without any such faces the arrays themselves are returned. What is not ``divided`` has no parts of its own
+        near sheets yet. Collective.
         """
         slits: list[np.ndarray] = []
         if self.narrow is not None:
             pairs = zip(self.openness, self.face_kind, strict=True)
             slits = [(openness < pressure.SLIT) & (kind == kinds.PRESSURE) for openness, kind in pairs]
-        return self._extension.faces(faces, self.narrow, slits, self.sheets)
+        return self._extension.faces(faces, self.narrow, slits, self.sheets if divided else None)
 
     # ---- observation ------------------------------------------------------------------------------------------
 

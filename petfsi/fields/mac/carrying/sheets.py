@@ -167,6 +167,7 @@ class Sheets:
         Those that come from too far are marked as ``left``, by axis in the cells above or, where divided, to whose
         pieces they belong; faces that have kept what they have of their ``own`` as ``kept``.
         """
+        assert len(path.parts) == len(faces.parts) == len(self.table), "kernels would read beyond the parts' end"
         done = np.zeros(len(self.table), dtype=bool)
         if self.any:
             masks = [np.ones(self._fluid.shape, dtype=bool)] * len(left) if where is None else where
@@ -275,6 +276,7 @@ class Sheets:
         fresh : list of ndarray of bool
             Face arrays.
         """
+        assert len(faces.parts) == len(self.table), "kernels would read beyond the parts' end"
         grid, cut = self.grid, self._without(fresh)
         new = Faces([array.copy() for array in faces], faces.parts)
         for a, array in enumerate(new):
