@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -215,3 +216,16 @@ def test_a_checkpoint_that_a_run_at_work_replaces_is_looked_for_again(scene, her
     simulation = Simulation(comm, load_scene(scene))
     origin.begin(simulation)
     assert origin.found.step == 4
+
+
+def test_a_run_killed_before_it_made_room_has_no_checkpoint_too_many_in_the_end(scene, here):
+    every = ("--set", "checkpoint.every=0.1", "--set", "checkpoint.keep=2")
+    assert here("run", scene, "--out", "run", *every, "--steps", 3).returncode == 0
+    shutil.copytree("run/checkpoint", "aside")
+    assert here("resume", "run").returncode == 0
+    end = everything("run/checkpoint")
+    shutil.copytree("aside", "run/checkpoint", dirs_exist_ok=True)
+    Path("run/summary.json").unlink()  # it comes last
+    assert len(everything("run/checkpoint")) > len(end) == 4
+    done = here("resume", "run")
+    assert done.returncode == 0 and everything("run/checkpoint") == end

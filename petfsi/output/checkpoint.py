@@ -104,8 +104,13 @@ def write_checkpoint(
         raise SolveError(
             f"step {step}, t = {time:g} s: checkpoint {path} could not be written: {why}. {last}"
         ) from error
-    on_root(comm, lambda: _prune(path.parent, step, keep))
+    prune_checkpoints(path.parent, step, keep, comm)
     return path
+
+
+def prune_checkpoints(directory: Path, step: int, keep: int, comm: MPI.Comm) -> None:
+    """Remove all but the last ``keep`` checkpoints up to a step, that of a good one, and those after it. Collective."""
+    on_root(comm, lambda: _prune(Path(directory), step, keep))
 
 
 def _prepare(directory: Path) -> None:

@@ -131,6 +131,9 @@ class Run:
         step = self.simulation.step
         if self._saved != step:
             self.checkpoint()
+        else:  # whoever wrote it may have been killed before there were no more than are to be kept
+            keep = self.simulation.scene.checkpoint.keep
+            checkpoints.prune_checkpoints(self.files.checkpoints, step, keep, self.comm)
         summary = self.summary(status, why)
         write_summary(self.files.summary, summary, self.comm)
         self.tell(self.console.note, summary)
