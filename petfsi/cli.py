@@ -16,7 +16,15 @@ from petfsi import __version__
 from petfsi.messages import screen
 from petfsi.runs.arguments import Duration, Seconds, SolverCommand
 from petfsi.runs.console import open_streams
-from petfsi.runs.ending import INTERRUPTED, alone, launched_rank, say, start_mpi, together
+from petfsi.runs.ending import (
+    INTERRUPTED,
+    alone,
+    launched_rank,
+    say,
+    say_briefly_what_cannot_be_freed,
+    start_mpi,
+    together,
+)
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -377,6 +385,7 @@ def _start_petsc(words: Sequence[str] | None = None, comm: MPI.Comm | None = Non
         petsc4py.init(["petfsi", "-skip_petscrc", "-no_signal_handler", *given])
     finally:
         os.environ.update(hidden)
+    say_briefly_what_cannot_be_freed()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

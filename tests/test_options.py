@@ -93,6 +93,8 @@ def test_what_speaks_to_the_screen_is_not(word):
         ("ksp_richardson_scale", "inf", "a number that is one, and finite"),
         ("ksp_chebyshev_eigenvalues", "0.4,1e999", "too large"),
         ("pc_factor_levels", "100000", "out of range"),
+        ("pc_mg_levels", "0", "is out of range; wanted a whole number from 1 to 100"),
+        ("fieldsplit_pressure_pc_factor_mat_solver_type", "SuperLU", "can end the process"),
         ("ksp_bcgsl_ell", "100000000", "out of range; wanted a whole number from 1 to 100"),
         ("ksp_fischer_guess", "1,100000000", "out of range"),
         ("pc_factor_shift_amount", "a b", "blanks, quotes, paths"),
@@ -105,6 +107,7 @@ def test_what_speaks_to_the_screen_is_not(word):
 def test_a_value_out_of_range_is_told_with_the_range(name, value, said):
     assert said in fault(f"fsi_{name}", value)
     assert not fault("fsi_pc_hypre_boomeramg_relax_type_coarse", "symmetric-SOR/Jacobi")
+    assert not fault("fsi_pc_factor_levels", "0") and not fault("fsi_pc_factor_mat_solver_type", "superlu_dist")
 
 
 def test_every_shipped_file_passes():

@@ -157,3 +157,12 @@ def test_a_refusal_names_what_the_user_gave(words, said, run):
     code, told = run(*words.split())
     assert code == 2 and said in told, told
     assert len(told.splitlines()) == 1, told
+
+
+def test_a_solver_that_cannot_be_freed_either_leaves_no_traceback(tmp_path):
+    """hypre refuses to be set up, and to be taken down: PETSc says so once more when the process ends."""
+    given = "-fsi_pc_type hypre -fsi_mat_type aij -fsi_pc_hypre_boomeramg_strong_threshold 3".split()
+    command = [sys.executable, "-m", "petfsi.cli", "run", str(SCENE), "--out", "away", *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment(), cwd=tmp_path)
+    assert done.returncode == 2 and "Error in HYPRE_BoomerAMGSetStrongThreshold" in done.stderr
+    assert "Traceback" not in done.stderr and len(done.stderr.splitlines()) <= 2, done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 import time
 import traceback
 from collections.abc import Callable
@@ -87,6 +88,18 @@ def together(work: Callable[[Any], int]) -> int:
         for said in dict.fromkeys(said for _, said in verdicts):
             _complain(said)
     return verdicts[0][0]
+
+
+def say_briefly_what_cannot_be_freed() -> None:
+    """Let PETSc, which has been started, have a line where it cannot free a solver at the process's end."""
+    sys.unraisablehook = _say_in_a_line
+
+
+def _say_in_a_line(what: sys.UnraisableHookArgs) -> None:
+    if what.exc_value is None or type(what.exc_value).__module__ != "petsc4py.PETSc":
+        sys.__unraisablehook__(what)
+    elif launched_rank() == 0:
+        _complain(f"PETSc could not free all that it held: {shown(str(what.exc_value).splitlines()[0], 200)}")
 
 
 def start_mpi() -> None:

@@ -94,6 +94,7 @@ RANGES = {
     "_nprealloc": Range(0, 1000, whole=True),
     "_max_eigen": Range(0, 1000, whole=True),
     "_fischer_guess": Range(1, 1000, whole=True),
+    "_mg_levels": Range(1, 100, whole=True),  # PETSc looks for the last one of none
     "_levels": Range(0, 100, whole=True),
     "_overlap": Range(0, 100, whole=True),
     "_sweeps": Range(0, 1000, whole=True),
@@ -114,6 +115,8 @@ RANGES = {
     "_mumps_icntl_4": Range(0, 4, whole=True),
     "_mumps_icntl_22": Range(0, 0, whole=True),
 }
+#: How names end of packages that factor, and those of them that can end the process where they do.
+_FACTORS, _ABORTS = ("_mat_solver_type", "_mat_solver_package"), ("superlu",)
 #: How names end that mean nothing without a value, besides those.
 _VALUED = ("_type",)
 
@@ -174,6 +177,8 @@ def _misfit(name: str, value: str) -> str:
     wanted = next((limits for end, limits in RANGES.items() if name.endswith(end)), None)
     if (wanted is not None or name.endswith(_VALUED)) and not value:
         return "wants a value behind it"
+    if name.endswith(_FACTORS) and value.lower() in _ABORTS:
+        return "can end the process: as distributed it lacks MC64; wanted petsc, mumps, superlu_dist or another"
     if wanted is not None:
         parts = value.split(",") if name.endswith("_fischer_guess") else [value]
         return next(filter(None, map(wanted.fault, parts)), "")
