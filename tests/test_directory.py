@@ -43,6 +43,22 @@ poisson = 0.4
 supports = [{ where = "bottom", fix = ["x", "y"] }]
 """
 
+DAM = """
+dim = 2
+gravity = [0.0, -9.81]
+[time]
+end = 1.0
+dt = "auto"
+[fluid]
+kind = "sph"
+density = 1000.0
+origin = [0.0, 0.0]
+size = [1.0, 1.0]
+spacing = 0.1
+sound_speed = 30.0
+fill = [{{ mesh = "{mesh}" }}]
+"""
+
 
 @pytest.fixture
 def scene(tmp_path, monkeypatch):
@@ -229,3 +245,15 @@ def test_a_run_killed_before_it_made_room_has_no_checkpoint_too_many_in_the_end(
     assert len(everything("run/checkpoint")) > len(end) == 4
     done = here("resume", "run")
     assert done.returncode == 0 and everything("run/checkpoint") == end
+
+
+@pytest.mark.parametrize("ending", ["msh", "xdmf", "inp", "bdf"])
+@pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
+def test_a_mesh_that_is_no_file_is_named_wherever_it_stands(scene, here, make, ending):
+    make(f"thing.{ending}")
+    Path("dam.toml").write_text(DAM.format(mesh=f"thing.{ending}"))
+    for name, words in (("block", ["--set", f'solids.block.shape.mesh="thing.{ending}"']), ("dam", [])):
+        done = here("run", f"{name}.toml", "--out", "run", *words)
+        key = {"block": "solids.block.shape.mesh", "dam": "fluid.fill.0.mesh"}[name]
+        assert done.returncode == 2 and f"{key}: is no file but a " in done.stderr, done.stderr
+        assert f"thing.{ending}" in done.stderr and not Path("run").exists()

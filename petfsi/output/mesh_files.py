@@ -119,7 +119,9 @@ def _named(model: Any) -> Iterator[str]:
 
 
 def _with_companions(path: Path) -> list[Path]:
-    """Return a mesh file and those that it cannot be read without."""
+    """Return a mesh file and those that it cannot be read without; what is no file is told by who opens it."""
+    if not path.is_file():
+        return [path]
     ending = path.suffix.lower()
     others = {path.with_suffix(e) for pair in _PAIRS if ending in pair for e in pair - {ending}}
     if ending in (".xdmf", ".xmf"):

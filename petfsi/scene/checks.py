@@ -212,12 +212,13 @@ def _varies_along(inflow: Inflow) -> bool:
 
 
 def _mesh_files(scene: Scene) -> Problems:
-    for table in ("solids", "obstacles"):
-        for name, item in getattr(scene, table).items():
-            mesh = item.shape.mesh
-            if item.shape.kinds == ["mesh"] and (why := unreadable(scene.directory / mesh)):
-                # nearly in full, where a value would be shortened
-                yield Problem(f"{table}.{name}.shape.mesh", ABSENT, f"{why}: {shown(mesh, LONGEST)}")
+    tables = (("solids", scene.solids), ("obstacles", scene.obstacles))
+    shapes = {f"{table}.{name}.shape": item.shape for table, items in tables for name, item in items.items()}
+    shapes |= {f"fluid.fill.{n}": shape for n, shape in enumerate(getattr(scene.fluid, "fill", []))}
+    for key, shape in shapes.items():
+        if shape.kinds == ["mesh"] and (why := unreadable(scene.directory / str(shape.mesh))):
+            # nearly in full, where a value would be shortened
+            yield Problem(f"{key}.mesh", ABSENT, f"{why}: {shown(str(shape.mesh), LONGEST)}")
 
 
 def unreadable(path: Path) -> str:
