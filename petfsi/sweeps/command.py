@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from petfsi.errors import InputError
 from petfsi.messages import shown
@@ -85,9 +86,11 @@ def sweep(wanted: Wanted, say: Callable[[str], None]) -> int:
     if wanted.collect:
         rows = collect(folder, runs)
         say(f"{folder.table}: {len(rows)} runs")
+        _say_errors(folder, rows, say)
         _say_left_over(folder, runs, say)
         return DONE
     folder.check_inputs(chosen)
+    folder.read_rule()
     if wanted.retry:
         if wanted.retry == "changed" and plan is None and not _renewed(folder, plan, chosen, wanted.retry):
             raise InputError("no run here is other than planned; what the sweep's file changes needs that file")
@@ -104,7 +107,8 @@ def _work(
     why = Pool(folder, chosen, cores, say).work()
     _say_states(folder, runs, chosen, cores, say)
     try:
-        collect(folder, runs)
+        rows = collect(folder, runs)
+        _say_errors(folder, rows, say)
         say(f"{folder.table}: a row for each; again with: petfsi sweep {folder.path} --collect")
     except OSError as error:
         say(f"{folder.table} could not be written: {files.reason(error)}")
@@ -265,6 +269,20 @@ def _say_states(
     _say_left_over(folder, runs, say)
     say(f"{len(chosen)}{rest} runs: {_counts(counts)}{_time_left(looks, ranks, cores)}")
     return DONE
+
+
+def _say_errors(folder: SweepFolder, rows: Sequence[dict[str, Any]], say: Callable[[str], None]) -> None:
+    """Say how many runs have an error, between what, and why the others of those that are done have none."""
+    rule = folder.read_rule()
+    if rule is None:
+        return
+    known = [row["error"] for row in rows if row["error"] is not None]
+    spread = f", {min(known):.2g} to {max(known):.2g}" if known else ""
+    of, against = ", ".join(rule.of), rule.source or f"{rule.reference} along {', '.join(rule.along)}"
+    say(f"error of {of} ({rule.norm}) against {against}: {len(known)} of {len(rows)} runs{spread}")
+    notes = Counter(row["error_note"] for row in rows if row["error_note"])
+    for note, count in notes.most_common(_TOLD):
+        say(f"  {count}: {note}")
 
 
 def _counts(states: Counter[str]) -> str:

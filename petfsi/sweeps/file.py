@@ -14,10 +14,11 @@ from petfsi.errors import InputError
 from petfsi.messages import shown
 from petfsi.scene.dump import as_toml
 from petfsi.scene.raw import read_raw
+from petfsi.sweeps.error_rule import ErrorRule, read_rule
 from petfsi.sweeps.names import point_text, points_meant
 from petfsi.sweeps.values import is_dated, read_values
 
-KEYS = ("scene", "set", "repeat", "steps", "axis", "exclude")
+KEYS = ("scene", "set", "repeat", "steps", "axis", "exclude", "error")
 #: Words of an axis whose points are values, and of a point that has a name.
 BY_VALUE, BY_NAME = ("key", "option", "ranks", "values"), ("options_file", "options", "set", "ranks")
 #: Runs of the largest sweep, ranks of the largest run, and rounds.
@@ -73,6 +74,10 @@ class SweepFile:
     axes : dict of str to list of Point
     excluded : list of dict
         By axis the points that do not go together.
+    rule : ErrorRule or None
+        How runs are judged, if they are.
+    table : bytes
+        The reference for that, where it is a table.
     """
 
     path: Path
@@ -83,6 +88,8 @@ class SweepFile:
     steps: int | None
     axes: dict[str, list[Point]]
     excluded: list[dict[str, list[str]]]
+    rule: ErrorRule | None = None
+    table: bytes = b""
 
     def excludes(self, points: Mapping[str, Point]) -> bool:
         """Return whether a combination of points is left out."""
@@ -110,6 +117,7 @@ def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
         mistakes.append("scene: must name a scene's file, relative to this one")
         scene = ""
     axes = _axes(data.get("axis", {}), mistakes)
+    rule, table = _rule(data["error"], path.parent, axes, mistakes) if "error" in data else (None, b"")
     return SweepFile(
         path=path,
         text=path.read_bytes(),
@@ -119,7 +127,17 @@ def read_sweep_file(path: Path, mistakes: list[str]) -> SweepFile:
         steps=_whole("steps", data["steps"], 2**53, mistakes) if "steps" in data else None,
         axes=axes,
         excluded=_excluded(data.get("exclude", []), data.get("axis", {}), axes, mistakes),
+        rule=rule,
+        table=table,
     )
+
+
+def _rule(
+    given: Any, directory: Path, axes: Mapping[str, list[Point]], mistakes: list[str]
+) -> tuple[ErrorRule | None, bytes]:
+    texts = {name: [point.text for point in points] for name, points in axes.items()}
+    decides = {name: {key for point in points for key in point.sets} for name, points in axes.items()}
+    return read_rule(given, directory, texts, decides, mistakes)
 
 
 # ---- axes ---------------------------------------------------------------------------------------------------

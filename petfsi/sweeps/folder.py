@@ -22,7 +22,9 @@ from petfsi.output.mesh_files import copy_mesh, mesh_files
 from petfsi.scene.load import load_scene
 from petfsi.sweeps.attempts import NAME as ATTEMPTS
 from petfsi.sweeps.claim import NAME as CLAIM
-from petfsi.sweeps.plan import INPUTS, Plan, Planned, digest_of, mesh_folders
+from petfsi.sweeps.error_rule import ErrorRule
+from petfsi.sweeps.names import digest_of
+from petfsi.sweeps.plan import INPUTS, Plan, Planned, mesh_folders
 
 #: Marks a folder as a sweep's.
 MARKER, FORMAT = ".petfsi-sweep", 1
@@ -55,6 +57,11 @@ class SweepFolder:
     def table(self) -> Path:
         """A row for every run, with what came out."""
         return self.path / "runs.csv"
+
+    @property
+    def rule(self) -> Path:
+        """How its runs are judged; none where they are not."""
+        return self.path / "error.json"
 
     @property
     def inputs(self) -> Path:
@@ -122,6 +129,16 @@ class SweepFolder:
                 )
             found.append(run)
         return found
+
+    def read_rule(self) -> ErrorRule | None:
+        """Return how runs are judged; InputError if that cannot be read."""
+        try:
+            return ErrorRule.read(files.read_small(self.rule, _MOST))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError):
+            again = f"petfsi sweep SWEEP.toml --out {self.path}"
+            raise InputError(f"{self.rule} cannot be read; it is written anew by: {again}") from None
 
     def read_run(self, name: str) -> Planned | None:
         """Return what a run's directory says that it is; None if it does not, or its hash is another's."""
@@ -246,6 +263,10 @@ class SweepFolder:
         for run in unknown:
             self.prepare(run)
         files.replace_text(self.path / "sweep.toml", plan.text)
+        if plan.rule is not None:
+            files.replace_text(self.rule, plan.rule.text())
+        else:
+            self.rule.unlink(missing_ok=True)
         files.replace_text(self.plan, _plan_text(plan))
 
     def prepare(self, run: Planned) -> None:

@@ -15,8 +15,15 @@ from petfsi.scene.dump import as_toml
 LONGEST = 120
 #: Of the hash that stands for what a name cannot say.
 _DIGITS = 8
+#: Of digests in the names of files.
+DIGITS = 12
 _REFUSED = re.compile(r"[^A-Za-z0-9._+-]+")
 _REPEAT = re.compile(r"_r[0-9]+$")
+
+
+def digest_of(data: bytes) -> str:
+    """Return what stands for some bytes in the name of a file."""
+    return hashlib.sha256(data).hexdigest()[:DIGITS]
 
 
 def point_text(value: Any) -> str:

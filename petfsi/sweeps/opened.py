@@ -8,8 +8,7 @@ from typing import Any
 
 from petfsi.output.opened import OpenedRun
 from petfsi.sweeps.folder import SweepFolder
-from petfsi.sweeps.states import look_at
-from petfsi.sweeps.table import row_of
+from petfsi.sweeps.table import rows_of
 
 
 class OpenedSweep:
@@ -27,8 +26,8 @@ class OpenedSweep:
         self.path, self.names = self._folder.path, list(self._runs)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the rows of ``runs.csv`` as they are now: name, axes, state, figures."""
-        return [row_of(run, look_at(self._folder.run(name), run)) for name, run in self._runs.items()]
+        """Return the rows of ``runs.csv`` as they are now: name, axes, state, figures, errors."""
+        return rows_of(self._folder, list(self._runs.values()))
 
     def __getitem__(self, name: str) -> OpenedRun:
         """Return a run; InputError if it has not begun."""

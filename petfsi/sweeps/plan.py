@@ -27,16 +27,15 @@ from petfsi.scene.load import apply_set, scene_from_dict
 from petfsi.scene.raw import read_raw
 from petfsi.solving import options
 from petfsi.solving.option_rules import PREFIX
+from petfsi.sweeps.error_rule import ErrorRule
 from petfsi.sweeps.file import MOST_RUNS, Point, SweepFile, read_sweep_file
-from petfsi.sweeps.names import run_name
+from petfsi.sweeps.names import DIGITS, digest_of, run_name
 
 #: Where scenes, options files and meshes of the runs are, in a sweep's folder.
 INPUTS = "inputs"
-#: Digits of digests in names of files.
-_DIGITS = 12
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 _OPTION = re.compile(r"(^|: )-")
-_SCENE = re.compile(rf"{INPUTS}/scene-[0-9a-f]{{{_DIGITS}}}\.toml")
+_SCENE = re.compile(rf"{INPUTS}/scene-[0-9a-f]{{{DIGITS}}}\.toml")
 #: Runs that are the same as others, of those that are told.
 _TOLD = 8
 
@@ -127,6 +126,8 @@ class Plan:
         By name in ``INPUTS``: scenes and options files.
     meshes : dict of str to MeshFile
         By name in ``INPUTS``: mesh files, where they are now and what they were when the scene was read.
+    rule : ErrorRule or None
+        How its runs are judged.
     """
 
     text: bytes
@@ -134,6 +135,7 @@ class Plan:
     runs: list[Planned] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
     meshes: dict[str, MeshFile] = field(default_factory=dict)
+    rule: ErrorRule | None = None
 
 
 def plan_sweep(path: Path) -> Plan:
@@ -162,7 +164,9 @@ class _Planner:
     def __init__(self, file: SweepFile, mistakes: list[str]) -> None:
         self.file, self.mistakes = file, mistakes
         axes = {name: [point.text for point in points] for name, points in file.axes.items()}
-        self.plan = Plan(file.text, axes)
+        self.plan = Plan(file.text, axes, rule=file.rule)
+        if file.rule is not None and file.table:
+            self.plan.files[file.rule.reference] = file.table
         self._base: dict[str, Any] = {}
         self._directory = file.path.parent
         self._scenes: dict[str, tuple[str, dict[str, str]] | None] = {}
@@ -314,11 +318,6 @@ class _Planner:
 def scene_name(text: bytes) -> str:
     """Return the name of a scene's file among the inputs: another text has another."""
     return f"scene-{digest_of(text)}.toml"
-
-
-def digest_of(data: bytes) -> str:
-    """Return what stands for some bytes in the name of a file."""
-    return hashlib.sha256(data).hexdigest()[:_DIGITS]
 
 
 def mesh_folders(meshes: list[MeshFile]) -> Iterator[tuple[str, list[MeshFile]]]:

@@ -10,20 +10,39 @@ from typing import Any
 
 from petfsi.output import files
 from petfsi.sweeps.folder import SweepFolder
+from petfsi.sweeps.judge import Judged, judge
 from petfsi.sweeps.plan import Planned
 from petfsi.sweeps.states import Look, look_at
 
 #: Columns that every table has; an axis of such a name, or with a dot as in ``last.PROBE``, is ``axis.NAME``.
 FIXED = ["name", "state", "kind", "reason", "steps", "time", "ranks", "repeat", "unknowns"]
+FIXED += ["error", "error_bar", "error_note"]
 FIXED += ["iterations_mean", "iterations_max", "wall_s", "peak_mb", "attempts"]
 
 
 def collect(folder: SweepFolder, runs: Sequence[Planned]) -> list[dict[str, Any]]:
     """Write ``runs.csv``, and return its rows."""
-    rows = [row_of(run, look_at(folder.run(run.name), run)) for run in runs]
+    rows = rows_of(folder, runs)
     with folder.alone():
         # what a summary says may be no text
         files.replace_text(folder.table, table_text(rows).encode("utf-8", "backslashreplace"))
+    return rows
+
+
+def rows_of(folder: SweepFolder, runs: Sequence[Planned]) -> list[dict[str, Any]]:
+    """Return the rows of runs, with their errors where the sweep judges them; InputError if its rule cannot be read."""
+    looks = {run.name: look_at(folder.run(run.name), run) for run in runs}
+    rule = folder.read_rule()
+    if rule is None:
+        return [row_of(run, looks[run.name]) for run in runs]
+    done = {name: folder.run(name) for name, look in looks.items() if look.state == "done"}
+    judged = judge(folder.inputs, done, runs, rule)
+    rows = []
+    for run in runs:
+        came, row = judged.get(run.name, Judged(note="")), row_of(run, looks[run.name])
+        if not came.has_seconds:
+            row |= {key: None for key in row if key == "wall_s" or key.startswith("seconds.")}
+        rows.append(row | {"error": came.error, "error_bar": came.bar, "error_note": came.note})
     return rows
 
 
