@@ -91,6 +91,13 @@ def size(times: np.ndarray, values: np.ndarray, norm: str) -> float:
     return float(np.sqrt(weights @ magnitude**2 / weights.sum()))
 
 
+def _part(run: Series, window: tuple[float, float] | None) -> Series:
+    part = run.within(window)
+    if not len(part.times):
+        raise InputError("the run has no step in the window")
+    return part
+
+
 def error_of(run: Series, reference: Series, norm: str, window: tuple[float, float] | None = None) -> float:
     """Return how far a run is from a reference, relative to that; absolute where the reference is zero throughout.
 
@@ -107,9 +114,7 @@ def error_of(run: Series, reference: Series, norm: str, window: tuple[float, flo
     InputError
         If the run has no step there, or the reference is not known where the run is asked for.
     """
-    part = run.within(window)
-    if not len(part.times):
-        raise InputError("the run has no step in the window")
+    part = _part(run, window)
     if norm == "final":
         part = Series(part.times[-1:], part.values[-1:])
     wanted = reference.at(part.times)
@@ -156,8 +161,13 @@ def extrapolate(
         The scheme's.
     norm, window
         As for ``error_of``.
+
+    Raises
+    ------
+    InputError
+        As ``error_of`` does.
     """
-    finest = runs[-1].within(window)
+    finest = _part(runs[-1], window)
     at = [run.at(finest.times) for run in runs[:-1]] + [finest.values]
     differences = [b - a for a, b in zip(at, at[1:], strict=False)]
     sizes = [size(finest.times, one, norm) for one in differences]

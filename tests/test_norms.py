@@ -84,6 +84,11 @@ def test_a_bar_is_wider_where_the_order_is_not_the_schemes():
     assert error_of(two.limit, truth, "l2") < two.bar
 
 
+def test_a_window_without_steps_is_told_of_an_extrapolation_too():
+    with pytest.raises(InputError, match="no step in the window"):
+        extrapolate(made(2.0, [0.2, 0.1, 0.05]), 2.0, 2.0, "l2", (5.0, 6.0))
+
+
 def test_runs_that_agree_to_the_last_digit_have_no_bar():
     t = np.linspace(0.0, 2.0, 41)
     found = extrapolate([series(t, np.cos(t))] * 3, 2.0, 2.0, "l2")
