@@ -22,8 +22,8 @@ STRETCH = 0.05
 MARGIN = 0.9
 #: Parts of a step are too long if it is by more than rounding.
 SLACK = 1e-9
-#: A step that must be divided more often has blown up.
-MOST = 100_000
+#: A step is divided into so many at most: one that asks for more would seem to hang, or has blown up.
+MOST = 10_000
 
 
 class StableStep:
@@ -78,23 +78,25 @@ class StableStep:
         Raises
         ------
         InputError
-            At time zero, if it exceeds the stable step and the scene refuses that.
+            At time zero, if it exceeds the stable step and the scene refuses that, or ``MOST`` of them.
         SolveError
             Later.
         """
         if not self.limited:
             return 1
         limit, whose = self.present()
+        parts = dt / (MARGIN * limit) if limit > 0 else math.inf
+        kind = InputError if t == 0 else SolveError
+        stable = f"time.dt = {dt:g}: the stable step of {whose} is {limit:.4g} s at t = {t:g} s"
         if self._subcycles:
-            if not dt < MOST * limit:
-                raise SolveError(f"the stable step of {whose} has shrunk to {limit:.4g} s at t = {t:g} s: blown up")
-            return max(1, math.ceil(dt / (MARGIN * limit)))
+            if not parts <= MOST:
+                raise kind(
+                    f"{stable}, and a step is divided into {MOST:,} at most; set time.dt "
+                    f'below {MOST * MARGIN * limit:.3g}, or to "auto"'
+                )
+            return max(1, math.ceil(parts))
         if not dt <= limit:
-            kind = InputError if t == 0 else SolveError
-            raise kind(
-                f"time.dt = {dt:g}: the stable step of {whose} is {limit:.4g} s at t = {t:g} s; set "
-                f'time.dt below it, or to "auto", or time.above_limit = "subcycle"'
-            )
+            raise kind(f'{stable}; set time.dt below it, or to "auto", or time.above_limit = "subcycle"')
         return 1
 
     def parts(self, t: float, dt: float) -> Iterator[tuple[float, float]]:

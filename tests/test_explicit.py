@@ -102,6 +102,18 @@ def test_sub_steps_are_steps():
     assert divided.accounts.values == short.accounts.values
 
 
+def test_a_step_of_very_many_sub_steps_is_refused_by_their_number():
+    """Some 1e5 of them in one step look as if the run hung; a light solid of a fluid's scene asks for such a number."""
+    limit = true_limit(explicit())
+    with pytest.raises(InputError, match=r"time.dt = .*symplectic-euler is .* s at t = 0 s, .* 10,000 at most; set"):
+        with prepared(explicit({"dt": 9100 * limit, "end": 1e5 * limit, "above_limit": "subcycle"})):
+            pass
+    with prepared(explicit({"dt": 8000 * limit, "end": 1e5 * limit, "above_limit": "subcycle"})) as sim:
+        assert sim.stable.count(0.0, 8000 * limit) > 8000
+        with pytest.raises(SolveError, match=r"at t = 1 s, .* 10,000 at most; set time.dt below"):
+            sim.stable.count(1.0, 1e5 * limit)
+
+
 @pytest.mark.parallel([1, 2])
 def test_a_long_step_is_divided_anew_on_its_way():
     """The block is stretched and bent on the way, and its waves become faster: its tip swings by more than a metre."""
