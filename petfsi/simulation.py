@@ -252,7 +252,7 @@ class Simulation:
         """Assemble the first step without moving, and refuse a scene in which it has no solution. Collective."""
         if resumes_at is None:
             self.dt = self._length(self.time)
-            self.stable.count(self.time, self.dt)
+            self.notes += self.stable.notes(self.time, self.dt)
         else:
             self.dt = self._stepping.length(resumes_at)
         for coupling in self.couplings:

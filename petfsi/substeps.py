@@ -24,6 +24,8 @@ MARGIN = 0.9
 SLACK = 1e-9
 #: A step is divided into so many at most: one that asks for more would seem to hang, or has blown up.
 MOST = 10_000
+#: A step of so many is told of.
+MANY = 100
 
 
 class StableStep:
@@ -86,18 +88,30 @@ class StableStep:
             return 1
         limit, whose = self.present()
         parts = dt / (MARGIN * limit) if limit > 0 else math.inf
-        kind = InputError if t == 0 else SolveError
-        stable = f"time.dt = {dt:g}: the stable step of {whose} is {limit:.4g} s at t = {t:g} s"
+        kind, length = (InputError, f"time.dt = {dt:g}") if t == 0 else (SolveError, f"a step of {dt:g} s")
+        stable = f"{length}: the stable step of {whose} is {limit:.6g} s at t = {t:g} s"
         if self._subcycles:
             if not parts <= MOST:
+                # no more than that where it is rounded
+                most = 0.999 * MOST * MARGIN * limit
                 raise kind(
-                    f"{stable}, and a step is divided into {MOST:,} at most; set time.dt "
-                    f'below {MOST * MARGIN * limit:.3g}, or to "auto"'
+                    f"{stable}, and a step is divided into {MOST:,} at most; set time.dt to {most:.4g} or less, or to "
+                    '"auto"'
                 )
             return max(1, math.ceil(parts))
         if not dt <= limit:
             raise kind(f'{stable}; set time.dt below it, or to "auto", or time.above_limit = "subcycle"')
         return 1
+
+    def notes(self, t: float, dt: float) -> list[str]:
+        """Say of how many parts the first step is, if these make it long. Collective; raises what ``count`` does."""
+        number = self.count(t, dt)
+        if number < MANY:
+            return []
+        return [
+            f"a step of {dt:g} s is divided into {number:,} sub-steps, as the stable one asks for: the run speaks, and "
+            "stops if told to, after all of them"
+        ]
 
     def parts(self, t: float, dt: float) -> Iterator[tuple[float, float]]:
         """Divide a step of length dt that begins at t: yield begin and length of each part, to be taken then.

@@ -94,6 +94,12 @@ def test_what_speaks_to_the_screen_is_not(word):
         ("ksp_chebyshev_eigenvalues", "0.4,1e999", "too large"),
         ("pc_factor_levels", "100000", "out of range"),
         ("pc_mg_levels", "0", "is out of range; wanted a whole number from 1 to 100"),
+        # PETSc makes them all, deaf to signals: 23 GB, and no end
+        ("pc_asm_blocks", "1000000", "is out of range; wanted a whole number from 1 to 10000"),
+        ("fieldsplit_solid_pc_gasm_total_subdomains", "10001", "wanted a whole number from 1 to 10000"),
+        ("pc_hypre_boomeramg_grid_sweeps_all", "1000000000", "wanted a whole number from 0 to 1000"),
+        ("pc_mg_multiplicative_cycles", "1e9", "has no integer value; wanted a whole number from 0 to 1000"),
+        ("pc_gamg_agg_nsmooths", "101", "wanted a whole number from 0 to 100"),
         ("fieldsplit_pressure_pc_factor_mat_solver_type", "SuperLU", "can end the process"),
         ("ksp_bcgsl_ell", "100000000", "out of range; wanted a whole number from 1 to 100"),
         ("ksp_fischer_guess", "1,100000000", "out of range"),

@@ -97,8 +97,16 @@ RANGES = {
     "_mg_levels": Range(1, 100, whole=True),  # PETSc looks for the last one of none
     "_levels": Range(0, 100, whole=True),
     "_overlap": Range(0, 100, whole=True),
-    "_sweeps": Range(0, 1000, whole=True),
-    "_its": Range(0, 1000, whole=True),
+    # what is made, or done again, so many times: no signal is heard within
+    **dict.fromkeys(("_asm_blocks", "_jacobi_blocks", "_local_blocks"), Range(1, 10_000, whole=True)),
+    "_total_subdomains": Range(1, 10_000, whole=True),
+    **dict.fromkeys(("_sweeps", "_sweeps_all", "_sweeps_down", "_sweeps_up"), Range(0, 1000, whole=True)),
+    **dict.fromkeys(("_sweeps_coarse", "_its", "_lits", "_max_iter", "_maxiter"), Range(0, 1000, whole=True)),
+    **dict.fromkeys(("_cycles", "_esteig_steps", "_pod_size", "_hist_size"), Range(0, 1000, whole=True)),
+    **dict.fromkeys(("_nlevels", "_num_levels", "_euclid_level", "_eu_level"), Range(0, 100, whole=True)),
+    **dict.fromkeys(("_nsmooths", "_interp_refine", "_space_size"), Range(0, 100, whole=True)),
+    "_factorrowsize": Range(1, 10_000, whole=True),
+    "_mumps_icntl_14": Range(0, 10_000, whole=True),  # more memory, by so many hundredths
     "_factor_fill": Range(1, 1000),
     "_lag_change": Range(0, 1e300),
     "_lag_growth": Range(0, 1e300),

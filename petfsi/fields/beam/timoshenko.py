@@ -117,20 +117,22 @@ def _respond(d, length, axis, stiffness, N, slope, tangent):
     for e in range(n):
         weight, per_length = length[e] / 2, 2 / length[e]
         for g in range(N.shape[0]):
-            theta = kappa = 0.0
-            x, y = axis[e, 0], axis[e, 1]
+            theta = kappa = v_x = v_y = 0.0
             for a in range(3):
                 dN = slope[g, a] * per_length
-                x += dN * d[e, 3 * a]
-                y += dN * d[e, 3 * a + 1]
+                v_x += dN * d[e, 3 * a]
+                v_y += dN * d[e, 3 * a + 1]
                 theta += N[g, a] * d[e, 3 * a + 2]
                 kappa += dN * d[e, 3 * a + 2]
             c, s = math.cos(theta), math.sin(theta)
             t_x, t_y = c * axis[e, 0] - s * axis[e, 1], s * axis[e, 0] + c * axis[e, 1]
-            stretch, gamma = x * t_x + y * t_y, y * t_x - x * t_y
+            # of the derivative of u alone: small strains would drown in the round-off of an axis of length 1
+            half = math.sin(0.5 * theta)
+            eps, gamma = v_x * t_x + v_y * t_y - 2.0 * half * half, v_y * t_x - v_x * t_y - s
+            stretch = 1.0 + eps
             EA, GA, EI = weight * stiffness[e, 0], weight * stiffness[e, 1], weight * stiffness[e, 2]
-            force, shear, moment = EA * (stretch - 1.0), GA * gamma, EI * kappa
-            W[e] += 0.5 * (force * (stretch - 1.0) + shear * gamma + moment * kappa)
+            force, shear, moment = EA * eps, GA * gamma, EI * kappa
+            W[e] += 0.5 * (force * eps + shear * gamma + moment * kappa)
             for a in range(3):
                 dN = slope[g, a] * per_length
                 B[0, 3 * a], B[0, 3 * a + 1], B[0, 3 * a + 2] = dN * t_x, dN * t_y, N[g, a] * gamma
