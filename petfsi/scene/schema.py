@@ -57,7 +57,7 @@ class Time(Table):
     above_limit: Annotated[
         Literal["refuse", "subcycle"],
         Field(description="what becomes of steps above an explicit scheme's stable one"),
-        Doc("Whether steps above the stable one of what is explicit are refused or divided, into 10,000 at most."),
+        Doc("Whether steps above the stable one of what is explicit are refused or divided. At most 10,000 parts."),
     ] = "refuse"
     retries: Annotated[
         Whole,
